@@ -1,0 +1,376 @@
+"""Cameras and observations: one depth image, where it was taken from, the table, and the object in it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+MAX_DEPTH = 1.4
+"""Readings beyond this many metres count as none (the range of the thesis' sensor)."""
+IMAGE_SIZE = 224
+MIN_HEIGHT = 0.008
+"""Points lower than this above the table, in metres, are taken as table."""
+MAX_HEIGHT = 0.45
+MIN_POINTS = 50
+"""Fewest object points that anything can be inferred from (Kopicki's generator asks as many)."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion; pixel units, x right, y down, z forward."""
+
+    width: int = 640
+    height: int = 480
+    fx: float = 574.0
+    fy: float = 574.0
+    cx: float = 320.0
+    cy: float = 240.0
+
+    @classmethod
+    def load(cls, path: str | Path) -> Camera:
+        """Read width, height, fx, fy, cx, cy from a JSON file; ValueError names what is missing."""
+        return cls.from_dict(_read_json(path), str(path))
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any], where: str = "camera") -> Camera:
+        """From a mapping with the six numbers; others are ignored."""
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        for name in names:
+            if name not in values:
+                raise ValueError(f"{where} has no {name}; a camera file needs {', '.join(names)}")
+            value = values[name]
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+                raise ValueError(f"{where}: {name} is {value!r}, expected a number")
+            if name in ("width", "height", "fx", "fy") and value <= 0:
+                raise ValueError(f"{where}: {name} is {value}, expected a positive number")
+        return cls(int(values["width"]), int(values["height"]), *(float(values[name]) for name in names[2:]))
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(3, 3) intrinsic matrix."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    def directions(self) -> NDArray[np.float64]:
+        """(height, width, 3) viewing directions with z = 1, camera frame."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        return np.stack(((u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)), axis=-1)
+
+    def project(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        """Pixel coordinates (*batch, 2) of points (*batch, 3) in the camera frame."""
+        homogeneous = np.asarray(points, np.float64) @ self.matrix.T
+        return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+class Observation:
+    """One depth image and all that follows from it.
+
+    depth: (height, width) metres along z; 0 or NaN = no reading.
+    T_world_camera: (4, 4) pose of the camera in the world, whose table top is z = 0. Without it, the world is laid
+    into the table: z up, origin below the camera, x along the camera's.
+    table: (4,) plane in the camera frame, normal . p + offset = height over the table. Without it and without
+    T_world_camera it is fitted to the image.
+    mask: (height, width) bool, the object's pixels. Without it, the object is segmented.
+
+    Raises ValueError that says what is wrong with the image or that no object is seen.
+    """
+
+    def __init__(
+        self,
+        depth: NDArray[Any],
+        camera: Camera,
+        T_world_camera: NDArray[Any] | None = None,
+        table: NDArray[Any] | None = None,
+        mask: NDArray[Any] | None = None,
+    ) -> None:
+        self.camera = camera
+        self.depth = _check_depth(depth, camera)
+        if T_world_camera is not None:
+            self.T_world_camera = _check_pose(T_world_camera)
+        else:
+            plane = fit_table(self.depth, camera) if table is None else np.asarray(table, np.float64)
+            self.T_world_camera = _pose_over_table(plane)
+        if mask is not None and mask.shape != self.depth.shape:
+            raise ValueError(f"mask has shape {mask.shape}, expected that of the depth, {self.depth.shape}")
+        self._mask = None if mask is None else np.asarray(mask, bool)
+
+    @classmethod
+    def load(cls, depth: str | Path, camera: str | Path) -> Observation:
+        """Read a depth image (.png with depth_scale in the camera file, or .npy in metres) and a camera file.
+
+        The camera file is JSON with width, height, fx, fy, cx, cy, and where known depth_scale (metres per unit),
+        table_plane {normal, offset} in the camera frame, T_world_camera (4 x 4).
+        """
+        config = _read_json(camera)
+        intrinsics = Camera.from_dict(config, str(camera))
+        image = _read_depth(Path(depth), config.get("depth_scale"), Path(camera))
+        pose = config.get("T_world_camera")
+        plane = config.get("table_plane")
+        table = None
+        if plane is not None:
+            try:
+                table = np.array([*plane["normal"], plane["offset"]], np.float64)
+                table = table / np.linalg.norm(table[:3])
+                if table.shape != (4,) or not np.isfinite(table).all():
+                    raise ValueError
+            except (KeyError, TypeError, ValueError):
+                raise ValueError(f"{camera}: table_plane must be {{normal: [x, y, z], offset: d}}") from None
+        try:
+            return cls(image, intrinsics, pose if pose is None else np.array(pose, np.float64), table)
+        except ValueError as error:
+            raise ValueError(f"{depth}: {error}") from None
+
+    @cached_property
+    def table(self) -> NDArray[np.float64]:
+        """(4,) table plane in the camera frame: normal . p + offset is the height over the table."""
+        return np.append(self.T_world_camera[2, :3], self.T_world_camera[2, 3])
+
+    @cached_property
+    def height(self) -> NDArray[np.float32]:
+        """(height, width) metres over the table at each pixel; 0 where there is no reading."""
+        rays = self.camera.directions() @ self.table[:3]
+        return np.where(self.depth > 0, self.depth * rays + self.table[3], 0).astype(np.float32)
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """(height, width) pixels of the object: the largest connected thing on the table, preferring the centre.
+
+        Raises ValueError when nothing stands on the table.
+        """
+        return segment(self) if self._mask is None else self._mask & (self.depth > 0)
+
+    @cached_property
+    def points(self) -> NDArray[np.float32]:
+        """(num_points, 3) the object's points in the camera frame."""
+        cloud = self.camera.directions()[self.mask] * self.depth[self.mask][:, None]
+        return cloud.astype(np.float32)
+
+    @cached_property
+    def points_world(self) -> NDArray[np.float32]:
+        """(num_points, 3) the object's points in the world frame."""
+        T = self.T_world_camera
+        return (self.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+
+    def aimed(self, size: int = IMAGE_SIZE) -> Observation:
+        """The view of a camera in the same place that looks at the object's centre, upright, 460 pixels of f = 574
+        shrunk to `size` (the thesis' crop, section 3.3). Turning a camera about its centre loses nothing but pixels.
+        """
+        zoom = size / 460
+        middle = (size - 1) / 2
+        virtual = Camera(size, size, 574 * zoom, 574 * zoom, middle, middle)
+        gaze = self.points.mean(0).astype(np.float64)
+        z = gaze / np.linalg.norm(gaze)
+        up = self.table[:3]
+        x = np.cross(z, up)
+        if np.linalg.norm(x) < 1e-3:  # looking straight down: keep the camera's own right
+            x = np.array([1.0, 0, 0]) - z[0] * z
+        x /= np.linalg.norm(x)
+        turn = np.column_stack((x, np.cross(z, x), z))  # T_camera_virtual, rotation only
+        pixels = virtual.directions() @ turn.T @ self.camera.matrix.T
+        source = (pixels[..., :2] / np.maximum(pixels[..., 2:], 1e-6)).astype(np.float32)
+        # range along the ray is what a turn leaves as it is
+        rays = self.camera.directions()
+        distance = (self.depth * np.linalg.norm(rays, axis=-1)).astype(np.float32)
+        seen = cv2.remap(distance, source[..., 0], source[..., 1], cv2.INTER_NEAREST, borderValue=0)
+        mask = cv2.remap(self.mask.astype(np.uint8), source[..., 0], source[..., 1], cv2.INTER_NEAREST, borderValue=0)
+        depth = seen / np.linalg.norm(virtual.directions(), axis=-1)
+        T = self.T_world_camera.copy()
+        T[:3, :3] = T[:3, :3] @ turn
+        return Observation(depth, virtual, T, mask=mask)
+
+    def image(self) -> Float[Tensor, "2 224 224"]:
+        """What an evaluator sees: channel 0 the object's depth (m; 0 elsewhere), channel 1 each pixel's height (m).
+
+        Call it on an `aimed` observation.
+        """
+        depth = np.where(self.mask, self.depth, 0)
+        return torch.from_numpy(np.stack((depth, self.height)).astype(np.float32))
+
+
+def colourise(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view 3 height width"]:
+    """Depth, mean curvature g_xx + g_yy and Gaussian curvature g_xx g_yy - g_xy^2 (thesis, eqs 3.3 to 3.6).
+
+    Derivatives are central differences over 1 x 3 windows, in metres per pixel; zero where the window leaves the
+    object (depth 0). Square and signed roots bring the curvatures to the scale of the depth's own changes.
+    """
+    g = torch.nn.functional.pad(depth[:, None], (1, 1, 1, 1))[:, 0]
+    seen = torch.nn.functional.max_pool2d((g == 0).float()[:, None], 3, 1)[:, 0] == 0
+    middle = g[:, 1:-1, 1:-1]
+    g_xx = g[:, 1:-1, 2:] - 2 * middle + g[:, 1:-1, :-2]
+    g_yy = g[:, 2:, 1:-1] - 2 * middle + g[:, :-2, 1:-1]
+    g_xy = (g[:, 2:, 2:] - g[:, 2:, :-2] - g[:, :-2, 2:] + g[:, :-2, :-2]) / 4
+    mean = torch.where(seen, g_xx + g_yy, 0.0)
+    gaussian = torch.where(seen, g_xx * g_yy - g_xy * g_xy, 0.0)
+
+    def compress(value: Tensor) -> Tensor:
+        return value.sign() * value.abs().sqrt()
+
+    return torch.stack((depth, compress(mean), compress(compress(gaussian))), dim=1)
+
+
+def add_sensor_noise(
+    depth: NDArray[np.float64], camera: Camera, rng: np.random.Generator, normals: NDArray[np.float64] | None = None
+) -> NDArray[np.float32]:
+    """Depth as a structured-light sensor of 75 mm baseline would read it.
+
+    Gaussian disparity noise of 0.075 pixel on a grid 1.5 times coarser, disparity in steps of 1/8 pixel (the
+    simulator behind the thesis); holes at depth edges and where the surface is seen at less than 12 degrees.
+    normals: (height, width, 3) surface normals in the camera frame, if known.
+    """
+    baseline = 0.075
+    height, width = depth.shape
+    coarse = rng.normal(0, 0.075, (int(height / 1.5), int(width / 1.5))).astype(np.float32)
+    noise = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    valid = depth > 0
+    disparity = camera.fx * baseline / np.where(valid, depth, 1.0)
+    disparity = np.round((disparity + noise) * 8) / 8
+    noisy = camera.fx * baseline / np.maximum(disparity, 1e-3)
+    metres = np.where(valid, depth, MAX_DEPTH).astype(np.float32)
+    kernel = np.ones((3, 3), np.uint8)
+    edge = cv2.dilate(metres, kernel) - cv2.erode(metres, kernel) > 0.03
+    valid &= ~(edge & (rng.random(depth.shape) < 0.5))
+    if normals is not None:
+        rays = camera.directions()
+        cosine = np.abs((normals * rays).sum(-1)) / np.linalg.norm(rays, axis=-1)
+        valid &= cosine > np.sin(np.deg2rad(12))
+    return np.where(valid, noisy, 0).astype(np.float32)
+
+
+def fit_table(depth: NDArray[np.floating[Any]], camera: Camera, seed: int = 0) -> NDArray[np.float64]:
+    """The largest plane in a depth image, (4,), by RANSAC with a least-squares finish; its normal faces the camera.
+
+    Raises ValueError when fewer than a tenth of the readings lie on one plane.
+    """
+    rng = np.random.default_rng(seed)
+    valid = depth > 0
+    cloud = camera.directions()[valid] * depth[valid][:, None]
+    sample = cloud[rng.permutation(len(cloud))[:20_000]]
+    triples = sample[rng.integers(len(sample), size=(500, 3))]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals[length > 1e-8] / length[length > 1e-8, None]
+    offsets = -(normals * triples[length > 1e-8, 0]).sum(1)
+    probe = sample[:2_000]
+    counts = (np.abs(probe @ normals.T + offsets) < 0.006).sum(0)
+    if not counts.size or counts.max() < len(probe) / 10:
+        raise ValueError("no table plane is seen; give table_plane or T_world_camera in the camera file")
+    plane = np.append(normals[counts.argmax()], offsets[counts.argmax()])
+    for _ in range(3):
+        near = sample[np.abs(sample @ plane[:3] + plane[3]) < 0.004]
+        centre = near.mean(0)
+        normal = np.linalg.svd(near - centre, full_matrices=False)[2][2]
+        plane = np.append(normal, -normal @ centre)
+    return plane if plane[3] > 0 else -plane
+
+
+def segment(observation: Observation) -> NDArray[np.bool_]:
+    """The pixels of the one object: connected in the image without depth steps, on the table, nearest its middle.
+
+    Raises ValueError when nothing of at least 50 pixels stands on the table.
+    """
+    height, depth = observation.height, observation.depth
+    above = (depth > 0) & (depth < MAX_DEPTH) & (height > MIN_HEIGHT) & (height < MAX_HEIGHT)
+    count, labels, stats, centres = cv2.connectedComponentsWithStats(above.astype(np.uint8), connectivity=8)
+    rows, columns = depth.shape
+    best, best_value = 0, 0.0
+    for label in range(1, count):
+        area = stats[label, cv2.CC_STAT_AREA]
+        if area < MIN_POINTS:
+            continue
+        offset = np.hypot(centres[label][0] / columns - 0.5, centres[label][1] / rows - 0.5)
+        value = area * np.exp(-0.5 * (offset / 0.2) ** 2)
+        if value > best_value:
+            best, best_value = label, value
+    if best == 0:
+        raise ValueError("no object is seen above the table within 1.4 m; check the depth, its scale and the table plane")
+    # parts of one object may be cut apart by a shadow: take in what lies within 4 cm of it
+    cloud = observation.camera.directions() * depth[..., None]
+    main = labels == best
+    low, high = cloud[main].min(0) - 0.02, cloud[main].max(0) + 0.02
+    near = above & ((cloud >= low) & (cloud <= high)).all(-1)
+    joined = np.unique(labels[near])
+    whole = np.isin(labels, [label for label in joined if label and (near & (labels == label)).sum() > 0.9 * stats[label, 4]])
+    return np.asarray(main | whole)
+
+
+def _check_depth(depth: NDArray[Any], camera: Camera) -> NDArray[np.float32]:
+    image = np.asarray(depth)
+    if image.shape != (camera.height, camera.width):
+        size = " x ".join(str(n) for n in image.shape[::-1])
+        raise ValueError(f"depth is {size} pixels, but the camera is {camera.width} x {camera.height}")
+    if image.dtype.kind not in "fiu":
+        raise ValueError(f"depth has the type {image.dtype}, expected metres as floating-point numbers")
+    image = image.astype(np.float32)
+    image = np.where(np.isfinite(image) & (image > 0), image, 0).astype(np.float32)
+    readings = image[image > 0]
+    if not readings.size:
+        raise ValueError("depth holds no reading: every pixel is zero, negative, NaN or infinite")
+    if np.median(readings) > 20:
+        raise ValueError(
+            f"depth has a median of {np.median(readings):.0f} and looks like millimetres; give metres (divide by 1000) "
+            "or a depth_scale in the camera file"
+        )
+    return image
+
+
+def _check_pose(pose: NDArray[Any]) -> NDArray[np.float64]:
+    T = np.asarray(pose, np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError(f"T_world_camera must be a finite 4 x 4 matrix, got shape {T.shape}")
+    turn = T[:3, :3]
+    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
+        raise ValueError("T_world_camera's rotation is not orthonormal and right-handed")
+    return T
+
+
+def _pose_over_table(plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """T_world_camera for a table plane given in the camera frame."""
+    plane = plane / np.linalg.norm(plane[:3])
+    up = plane[:3]
+    right = np.array([1.0, 0, 0]) - up[0] * up
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack((right, np.cross(up, right), up))
+    T[2, 3] = plane[3]
+    return T
+
+
+def _read_json(path: str | Path) -> dict[str, Any]:
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"camera file {path} does not exist")
+    try:
+        values = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"camera file {path} is not JSON: {error}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"camera file {path} holds no mapping; it needs width, height, fx, fy, cx, cy")
+    return values
+
+
+def _read_depth(path: Path, scale: float | None, camera: Path) -> NDArray[np.float32]:
+    if not path.is_file():
+        raise FileNotFoundError(f"depth image {path} does not exist")
+    if path.suffix == ".npy":
+        try:
+            image = np.load(path, allow_pickle=False)
+        except (ValueError, EOFError, OSError) as error:
+            raise ValueError(f"depth image {path} cannot be read: {error}") from None
+    else:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise ValueError(f"depth image {path} cannot be read; give a 16-bit PNG or a .npy file in metres")
+    if image.ndim != 2:
+        raise ValueError(f"depth image {path} has {image.ndim} dimensions, expected one channel of depth")
+    if scale is None and image.dtype.kind in "iu":
+        raise ValueError(f"{camera} has no depth_scale (metres per unit, 0.001 for millimetres), which {path} needs")
+    return image.astype(np.float32) * np.float32(1.0 if scale is None else scale)

@@ -1,0 +1,135 @@
+"""Unit quaternions in wxyz order with w >= 0, rotation matrices, and steps in their tangent space.
+
+Everything is batched over leading dimensions and differentiable. Other quaternion orders are converted here
+and nowhere else.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_TINY = 1e-12
+
+
+def normalize(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Scale to unit length and choose the sign with w >= 0."""
+    unit = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(_TINY)
+    return torch.where(unit[..., :1] < 0, -unit, unit)
+
+
+def multiply(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
+    """Hamilton product: the rotation that applies b first, then a; dimensions broadcast. Not renormalised."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        dim=-1,
+    )
+
+
+def conjugate(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """The inverse rotation of a unit quaternion."""
+    return torch.cat((quaternion[..., :1], -quaternion[..., 1:]), dim=-1)
+
+
+def rotate(quaternion: Float[Tensor, "... 4"], vector: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
+    """Rotate vectors by unit quaternions; the leading dimensions broadcast."""
+    w, u = quaternion[..., :1], quaternion[..., 1:]
+    u, vector = torch.broadcast_tensors(u, vector)
+    twice = 2.0 * torch.linalg.cross(u, vector, dim=-1)
+    return vector + w * twice + torch.linalg.cross(u, twice, dim=-1)
+
+
+def to_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """The rotation matrix of a unit quaternion."""
+    w, x, y, z = quaternion.unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """The unit quaternion of a rotation matrix, by the branch with the largest divisor (Shepperd 1978)."""
+    m = matrix
+    trace = m.diagonal(dim1=-2, dim2=-1).sum(-1)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    # four times the products of q with each of its own components; each row is parallel to q
+    rows = torch.stack(
+        (
+            torch.stack((1 + trace, m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0],
+                         m[..., 1, 0] - m[..., 0, 1]), -1),
+            torch.stack((m[..., 2, 1] - m[..., 1, 2], 1 + xx - yy - zz, m[..., 1, 0] + m[..., 0, 1],
+                         m[..., 0, 2] + m[..., 2, 0]), -1),
+            torch.stack((m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] + m[..., 0, 1], 1 - xx + yy - zz,
+                         m[..., 2, 1] + m[..., 1, 2]), -1),
+            torch.stack((m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2],
+                         1 - xx - yy + zz), -1),
+        ),
+        dim=-2,
+    )  # fmt: skip
+    best = torch.stack((trace, xx, yy, zz), -1).argmax(-1)
+    row = torch.take_along_dim(rows, best[..., None, None].expand(*best.shape, 1, 4), dim=-2).squeeze(-2)
+    return normalize(row)
+
+
+def from_xyzw(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """From the xyzw order of SciPy and ROS."""
+    return normalize(quaternion.roll(1, dims=-1))
+
+
+def to_xyzw(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """To the xyzw order of SciPy and ROS."""
+    return quaternion.roll(-1, dims=-1)
+
+
+def exp(tangent: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+    """The rotation by |tangent| radians about tangent; smooth at zero."""
+    square = (tangent * tangent).sum(-1, keepdim=True)
+    angle = square.clamp_min(_TINY).sqrt()
+    small = square < 1e-8
+    half_sinc = torch.where(small, 0.5 - square / 48, torch.sin(angle / 2) / angle)
+    cosine = torch.where(small, 1 - square / 8, torch.cos(angle / 2))
+    return normalize(torch.cat((cosine, half_sinc * tangent), dim=-1))
+
+
+def log(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    """The shortest tangent vector t with exp(t) = quaternion, in radians."""
+    quaternion = normalize(quaternion)
+    w, u = quaternion[..., :1], quaternion[..., 1:]
+    square = (u * u).sum(-1, keepdim=True)
+    length = square.clamp_min(_TINY).sqrt()
+    scale = torch.where(square < 1e-8, 2 + square / 3, 2 * torch.atan2(length, w) / length)
+    return scale * u
+
+
+def angle(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"]) -> Float[Tensor, "..."]:
+    """The angle between two rotations, radians in [0, pi]."""
+    return log(multiply(conjugate(a), b)).norm(dim=-1)
+
+
+def slerp(
+    a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"], t: Float[Tensor, "..."]
+) -> Float[Tensor, "... 4"]:
+    """The rotation a fraction t of the shortest way from a to b (Shoemake 1985)."""
+    step = log(multiply(conjugate(a), b))
+    return normalize(multiply(a, exp(t[..., None] * step)))
+
+
+def from_axis_angle(axis: Float[Tensor, "... 3"], radians: Float[Tensor, "..."]) -> Float[Tensor, "... 4"]:
+    """The rotation by `radians` about the unit vector `axis`."""
+    return exp(axis * radians[..., None])
+
+
+def random(num: int, generator: torch.Generator) -> Float[Tensor, "num 4"]:
+    """Uniformly distributed rotations."""
+    return normalize(torch.randn(num, 4, generator=generator))
