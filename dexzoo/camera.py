@@ -188,12 +188,11 @@ class Observation:
         return Observation(depth, virtual, T, mask=mask)
 
     def image(self) -> Float[Tensor, "2 224 224"]:
-        """What an evaluator sees: channel 0 the object's depth (m; 0 elsewhere), channel 1 each pixel's height (m).
+        """What an evaluator sees: the object's depth and its height over the table, metres; 0 at all other pixels.
 
         Call it on an `aimed` observation.
         """
-        depth = np.where(self.mask, self.depth, 0)
-        return torch.from_numpy(np.stack((depth, self.height)).astype(np.float32))
+        return torch.from_numpy(np.where(self.mask, np.stack((self.depth, self.height)), 0).astype(np.float32))
 
 
 def colourise(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view 3 height width"]:

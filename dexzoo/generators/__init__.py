@@ -1,0 +1,1 @@
+"""Generative models: what proposes grasps for an observation."""

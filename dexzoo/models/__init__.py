@@ -1,0 +1,1 @@
+"""Evaluative models: what predicts whether a grasp will hold."""
