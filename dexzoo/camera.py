@@ -47,7 +47,7 @@ class Camera:
         names = ("width", "height", "fx", "fy", "cx", "cy")
         for name in names:
             if name not in values:
-                raise ValueError(f"{where} has no {name}; a camera file needs {', '.join(names)}")
+                raise ValueError(f"{where} has no {name}; it needs {', '.join(names)}")
             value = values[name]
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
                 raise ValueError(f"{where}: {name} is {value!r}, expected a number")
@@ -97,7 +97,7 @@ class Observation:
         if T_world_camera is not None:
             self.T_world_camera = _check_pose(T_world_camera)
         else:
-            plane = fit_table(self.depth, camera) if table is None else np.asarray(table, np.float64)
+            plane = fit_table(self.depth, camera) if table is None else _check_table(table)
             self.T_world_camera = _pose_over_table(plane)
         if mask is not None and mask.shape != self.depth.shape:
             raise ValueError(f"mask has shape {mask.shape}, expected that of the depth, {self.depth.shape}")
@@ -115,17 +115,17 @@ class Observation:
         image = _read_depth(Path(depth), config.get("depth_scale"), Path(camera))
         pose = config.get("T_world_camera")
         plane = config.get("table_plane")
-        table = None
-        if plane is not None:
-            try:
-                table = np.array([*plane["normal"], plane["offset"]], np.float64)
-                table = table / np.linalg.norm(table[:3])
-                if table.shape != (4,) or not np.isfinite(table).all():
-                    raise ValueError
-            except (KeyError, TypeError, ValueError):
-                raise ValueError(f"{camera}: table_plane must be {{normal: [x, y, z], offset: d}}") from None
         try:
-            return cls(image, intrinsics, pose if pose is None else np.array(pose, np.float64), table)
+            pose = None if pose is None else _check_pose(np.array(pose, np.float64))
+            table = None if plane is None else _check_table(np.array([*plane["normal"], plane["offset"]], np.float64))
+        except (KeyError, TypeError):
+            raise ValueError(
+                f"{camera}: table_plane must be {{normal: [x, y, z], offset: d}}, T_world_camera 4 rows of 4 numbers"
+            ) from None
+        except ValueError as error:
+            raise ValueError(f"{camera}: {error}") from None
+        try:
+            return cls(image, intrinsics, pose, table)
         except ValueError as error:
             raise ValueError(f"{depth}: {error}") from None
 
@@ -144,9 +144,14 @@ class Observation:
     def mask(self) -> NDArray[np.bool_]:
         """(height, width) pixels of the object: the largest connected thing on the table, preferring the centre.
 
-        Raises ValueError when nothing stands on the table.
+        Raises ValueError when nothing stands on the table, or a given mask holds no reading.
         """
-        return segment(self) if self._mask is None else self._mask & (self.depth > 0)
+        if self._mask is None:
+            return segment(self)
+        seen: NDArray[np.bool_] = self._mask & (self.depth > 0)
+        if not seen.any():
+            raise ValueError("the object's mask holds no depth reading; check that it belongs to this image")
+        return seen
 
     @cached_property
     def points(self) -> NDArray[np.float32]:
@@ -161,13 +166,15 @@ class Observation:
         return (self.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
     def aimed(self, size: int = IMAGE_SIZE) -> Observation:
-        """The view of a camera in the same place that looks at the object's centre, upright, 460 pixels of f = 574
-        shrunk to `size` (the thesis' crop, section 3.3). Turning a camera about its centre loses nothing but pixels.
+        """The view of a camera in the same place that looks at the object's centre, upright.
+
+        Its 460 pixels of f = 574 are shrunk to `size` (the thesis' crop, section 3.3). Turning a camera about its
+        centre loses nothing but pixels.
         """
         zoom = size / 460
         middle = (size - 1) / 2
         virtual = Camera(size, size, 574 * zoom, 574 * zoom, middle, middle)
-        gaze = self.points.mean(0).astype(np.float64)
+        gaze = self.points.mean(0, dtype=np.float64)
         z = gaze / np.linalg.norm(gaze)
         up = self.table[:3]
         x = np.cross(z, up)
@@ -245,13 +252,15 @@ def add_sensor_noise(
 
 
 def fit_table(depth: NDArray[np.floating[Any]], camera: Camera, seed: int = 0) -> NDArray[np.float64]:
-    """The largest plane in a depth image, (4,), by RANSAC with a least-squares finish; its normal faces the camera.
+    """The largest plane within 1.4 m, (4,), by RANSAC with a least-squares finish; its normal faces the camera.
 
     Raises ValueError when fewer than a tenth of the readings lie on one plane.
     """
     rng = np.random.default_rng(seed)
-    valid = depth > 0
+    valid = (depth > 0) & (depth < MAX_DEPTH)  # a wall behind the table may be larger than it
     cloud = camera.directions()[valid] * depth[valid][:, None]
+    if len(cloud) < MIN_POINTS:
+        raise ValueError(f"fewer than {MIN_POINTS} readings within {MAX_DEPTH} m; check the depth and its scale")
     sample = cloud[rng.permutation(len(cloud))[:20_000]]
     triples = sample[rng.integers(len(sample), size=(500, 3))]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
@@ -272,33 +281,36 @@ def fit_table(depth: NDArray[np.floating[Any]], camera: Camera, seed: int = 0) -
 
 
 def segment(observation: Observation) -> NDArray[np.bool_]:
-    """The pixels of the one object: connected in the image without depth steps, on the table, nearest its middle.
+    """The pixels of the one object: those above the table and connected in the image, large and near its middle.
 
     Raises ValueError when nothing of at least 50 pixels stands on the table.
     """
     height, depth = observation.height, observation.depth
     above = (depth > 0) & (depth < MAX_DEPTH) & (height > MIN_HEIGHT) & (height < MAX_HEIGHT)
-    count, labels, stats, centres = cv2.connectedComponentsWithStats(above.astype(np.uint8), connectivity=8)
+    # closing lets a component reach over a line of lost readings
+    closed = cv2.morphologyEx(above.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    count, labels, stats, centres = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    labels[~above] = 0
     rows, columns = depth.shape
     best, best_value = 0, 0.0
     for label in range(1, count):
         area = stats[label, cv2.CC_STAT_AREA]
-        if area < MIN_POINTS:
-            continue
         offset = np.hypot(centres[label][0] / columns - 0.5, centres[label][1] / rows - 0.5)
         value = area * np.exp(-0.5 * (offset / 0.2) ** 2)
-        if value > best_value:
+        if area >= MIN_POINTS and value > best_value:
             best, best_value = label, value
     if best == 0:
-        raise ValueError("no object is seen above the table within 1.4 m; check the depth, its scale and the table plane")
-    # parts of one object may be cut apart by a shadow: take in what lies within 4 cm of it
+        raise ValueError(
+            "no object is seen above the table within 1.4 m; check the depth, its scale and the table plane"
+        )
+    # parts of one object may be cut apart by a shadow: take in what lies within 2 cm of its box
     cloud = observation.camera.directions() * depth[..., None]
     main = labels == best
     low, high = cloud[main].min(0) - 0.02, cloud[main].max(0) + 0.02
     near = above & ((cloud >= low) & (cloud <= high)).all(-1)
     joined = np.unique(labels[near])
-    whole = np.isin(labels, [label for label in joined if label and (near & (labels == label)).sum() > 0.9 * stats[label, 4]])
-    return np.asarray(main | whole)
+    within = [label for label in joined if label and (near & (labels == label)).sum() > 0.9 * stats[label, 4]]
+    return np.asarray(main | np.isin(labels, within))
 
 
 def _check_depth(depth: NDArray[Any], camera: Camera) -> NDArray[np.float32]:
@@ -331,11 +343,22 @@ def _check_pose(pose: NDArray[Any]) -> NDArray[np.float64]:
     return T
 
 
+def _check_table(table: NDArray[Any]) -> NDArray[np.float64]:
+    """The plane with a unit normal."""
+    plane = np.asarray(table, np.float64)
+    if plane.shape != (4,) or not np.isfinite(plane).all() or not plane[:3].any():
+        raise ValueError(f"table plane is {plane.tolist()}, expected four numbers: a normal and an offset in metres")
+    if plane[3] <= 0:
+        raise ValueError("table plane lies above the camera: normal . p + offset must be a height over the table")
+    return np.asarray(plane / np.linalg.norm(plane[:3]))
+
+
 def _pose_over_table(plane: NDArray[np.float64]) -> NDArray[np.float64]:
     """T_world_camera for a table plane given in the camera frame."""
-    plane = plane / np.linalg.norm(plane[:3])
     up = plane[:3]
     right = np.array([1.0, 0, 0]) - up[0] * up
+    if np.linalg.norm(right) < 1e-3:  # the camera lies on its side: its own down will do
+        right = np.array([0, 1.0, 0]) - up[1] * up
     right /= np.linalg.norm(right)
     T = np.eye(4)
     T[:3, :3] = np.stack((right, np.cross(up, right), up))
@@ -356,7 +379,7 @@ def _read_json(path: str | Path) -> dict[str, Any]:
     return values
 
 
-def _read_depth(path: Path, scale: float | None, camera: Path) -> NDArray[np.float32]:
+def _read_depth(path: Path, scale: object, camera: Path) -> NDArray[np.float32]:
     if not path.is_file():
         raise FileNotFoundError(f"depth image {path} does not exist")
     if path.suffix == ".npy":
@@ -372,4 +395,6 @@ def _read_depth(path: Path, scale: float | None, camera: Path) -> NDArray[np.flo
         raise ValueError(f"depth image {path} has {image.ndim} dimensions, expected one channel of depth")
     if scale is None and image.dtype.kind in "iu":
         raise ValueError(f"{camera} has no depth_scale (metres per unit, 0.001 for millimetres), which {path} needs")
-    return image.astype(np.float32) * np.float32(1.0 if scale is None else scale)
+    if scale is not None and (isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 0 < scale < np.inf):
+        raise ValueError(f"{camera}: depth_scale is {scale!r}, expected metres per unit, a positive number")
+    return np.asarray(image * (1.0 if scale is None else scale), np.float32)

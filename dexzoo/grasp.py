@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -31,7 +31,11 @@ NUM_WAYPOINTS = 10
 PREGRASP, GRIP, SQUEEZE = 0, 6, 9
 """Waypoint indices of the pre-grasp, the grip (first full contact) and the squeeze."""
 NUM_JOINTS = 20
-NUM_TYPES = 10
+GRASP_TYPES = (
+    "power", "power_tube", "pinch", "pinch_support", "rim", "handle", "tripod", "lateral", "top", "edge",
+)  # fmt: skip
+"""Names of the grasp types; number 27 of a waypoint is the index into them."""
+NUM_TYPES = len(GRASP_TYPES)
 WAYPOINT_SIZE = 28
 POSITION, QUATERNION, JOINTS, TYPE = slice(0, 3), slice(3, 7), slice(7, 27), 27
 """Where the parts of a waypoint stand among its 28 numbers."""
@@ -47,7 +51,9 @@ class Grasps:
     frame: "world" or "camera".
     log_likelihood: (num_grasps,) under the generator that proposed them, or None.
 
-    Raises ValueError when the shape is wrong, a number is not finite, or a quaternion is not unit.
+    Quaternions are stored with w >= 0, whichever of the two signs is given.
+    Raises ValueError when the shape is wrong, a number is not finite, a quaternion is not unit, or a grasp type is
+    none of 0...9.
     """
 
     waypoints: Float[Tensor, "grasp 10 28"]
@@ -70,6 +76,13 @@ class Grasps:
                 f"quaternion of grasp {grasp}, waypoint {waypoint} has length "
                 f"{float(w[grasp, waypoint, QUATERNION].norm()):.3f}, expected 1 (wxyz at 3:7)"
             )
+        types = w[..., TYPE].round()
+        if ((types < 0) | (types >= NUM_TYPES)).any():
+            bad = int(((types < 0) | (types >= NUM_TYPES)).any(1).nonzero()[0])
+            raise ValueError(f"grasp {bad} has the type {float(w[bad, 0, TYPE]):g}, expected 0 to 9 (number 27)")
+        if (w[..., 3] < 0).any():
+            quaternion = torch.where(w[..., 3:4] < 0, -w[..., QUATERNION], w[..., QUATERNION])
+            object.__setattr__(self, "waypoints", torch.cat((w[..., POSITION], quaternion, w[..., 7:]), dim=-1))
         if self.log_likelihood is not None and self.log_likelihood.shape != w.shape[:1]:
             raise ValueError(
                 f"log_likelihood has shape {tuple(self.log_likelihood.shape)}, expected ({w.shape[0]},) for the grasps"
@@ -120,11 +133,11 @@ class Grasps:
     def __len__(self) -> int:
         return self.waypoints.shape[0]
 
-    def __getitem__(self, index: Tensor | slice | list[int] | np.ndarray | int) -> Grasps:
-        """A subset, as Grasps: by slice, mask, list or order of indices."""
+    def __getitem__(self, index: Tensor | slice | list[int] | np.ndarray | np.integer[Any] | int) -> Grasps:
+        """A subset, as Grasps: by slice, mask, list, order of indices, or one index."""
         if isinstance(index, np.ndarray):
             index = torch.as_tensor(index)
-        if isinstance(index, (int, np.integer)):
+        if isinstance(index, (int, np.integer)) or (isinstance(index, Tensor) and not index.ndim):
             index = [int(index)]
         likelihood = None if self.log_likelihood is None else self.log_likelihood[index]
         return replace(self, waypoints=self.waypoints[index], log_likelihood=likelihood)
@@ -158,7 +171,9 @@ class Grasps:
         """The same grasps in "world" or "camera", given the pose of the camera in the world, (4, 4)."""
         if frame == self.frame:
             return self
-        T = torch.as_tensor(np.asarray(T_world_camera, dtype=np.float64))
+        T = torch.as_tensor(T_world_camera, dtype=torch.float64)
+        if T.shape != (4, 4):
+            raise ValueError(f"T_world_camera has shape {tuple(T.shape)}, expected (4, 4)")
         if frame == "camera":
             T = torch.linalg.inv(T)
         return replace(self, waypoints=transform_waypoints(T.to(self.waypoints), self.waypoints), frame=frame)
@@ -181,7 +196,9 @@ class Grasps:
                 frame = (file.metadata() or {}).get("frame", "")
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118, not a dict
         except SafetensorError as error:
-            raise ValueError(f"{path} is not a safetensors file of grasps ({error}); write it with Grasps.save") from None
+            raise ValueError(
+                f"{path} is not a safetensors file of grasps ({error}); write it with Grasps.save"
+            ) from None
         if "waypoints" not in tensors:
             raise ValueError(f"{path} holds no tensor named waypoints; write it with Grasps.save")
         if frame not in ("world", "camera"):
@@ -190,7 +207,9 @@ class Grasps:
         return cls(tensors["waypoints"].float(), frame, None if likelihood is None else likelihood.float())
 
 
-def pose_matrix(position: Float[Tensor, "*batch 3"], quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4 4"]:
+def pose_matrix(
+    position: Float[Tensor, "*batch 3"], quaternion: Float[Tensor, "*batch 4"]
+) -> Float[Tensor, "*batch 4 4"]:
     """Homogeneous matrices from positions and unit quaternions."""
     top = torch.cat((rotation.to_matrix(quaternion), position[..., None]), dim=-1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)

@@ -1,249 +1,22 @@
 """The hand: forward kinematics, coupled joints, limits and signed distances, all differentiable.
 
-A hand is a folder with a URDF (kinematics, masses, limits, coupling) and a hand.yaml (shapes, pads, ignored contacts).
-The same tables feed the simulator, so the two cannot drift apart.
+Its tables (`HandSpec`) feed the simulator too, so the two cannot drift apart.
 """
 
 from __future__ import annotations
 
-import difflib
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 import torch
-import yaml
-import yourdfpy
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from dexzoo.resources import resource
+from dexzoo.hand_spec import HandSpec, Inertia, Joint, Pad, Primitive, Side
 
-Side = Literal["right", "left"]
-_MIRROR = {"x": (-1.0, 1.0, 1.0), "y": (1.0, -1.0, 1.0), "z": (1.0, 1.0, -1.0)}
-
-
-@dataclass(frozen=True)
-class Primitive:
-    """A box of half sizes `half` rounded by `radius`: a capsule where two of the half sizes are zero.
-
-    pose: (4, 4) in the frame of the link; lengths in metres.
-    """
-
-    link: str
-    pose: np.ndarray
-    half: np.ndarray
-    radius: float
-
-
-@dataclass(frozen=True)
-class Joint:
-    """One joint of the tree; a fixed joint has no axis. Coupled: angle = multiplier * angle of `mimic` + offset."""
-
-    name: str
-    parent: str
-    child: str
-    origin: np.ndarray  # (4, 4), T_parent_child at angle 0
-    axis: np.ndarray | None
-    lower: float
-    upper: float
-    effort: float
-    damping: float
-    mimic: str | None
-    multiplier: float
-    offset: float
-
-
-@dataclass(frozen=True)
-class Inertia:
-    """Mass in kg, centre of mass in m and inertia about it in kg m2, in the frame of the link."""
-
-    mass: float
-    center: np.ndarray
-    matrix: np.ndarray
-
-
-@dataclass(frozen=True)
-class Pad:
-    """Where a fingertip touches: a point and an outward normal in the frame of its link."""
-
-    link: str
-    point: np.ndarray
-    normal: np.ndarray
-
-
-@dataclass(frozen=True)
-class HandSpec:
-    """Everything known of a hand, as tables. Joints are in tree order: a parent stands before its children."""
-
-    name: str
-    side: Side
-    palm: str
-    joints: tuple[Joint, ...]
-    joint_names: tuple[str, ...]  # order of the posture vector
-    link_names: tuple[str, ...]
-    inertias: dict[str, Inertia]
-    primitives: tuple[Primitive, ...]
-    pads: dict[str, Pad]
-    exclude: tuple[tuple[str, str], ...]
-
-    @classmethod
-    def load(cls, name: str | Path = "dlr2", side: Side = "right") -> HandSpec:
-        """Read a hand by its name in robots/ or from a folder.
-
-        Raises FileNotFoundError for an unknown hand, ValueError for tables that contradict each other.
-        """
-        if side not in ("right", "left"):
-            raise ValueError(f'side {side!r} is unknown, use "right" or "left"')
-        folder = Path(name) if Path(name).is_dir() else resource("robots") / str(name)
-        if not (folder / "hand.yaml").is_file():
-            known = sorted(path.parent.name for path in resource("robots").glob("*/hand.yaml"))
-            raise FileNotFoundError(f"hand {str(name)!r} has no hand.yaml; known hands: {', '.join(known)}, or give a folder")
-        config: dict[str, Any] = yaml.safe_load((folder / "hand.yaml").read_text())
-        urdf = yourdfpy.URDF.load(str(folder / config["urdf"]), load_meshes=False, build_scene_graph=False).robot
-        joint_names = tuple(joint for finger in config["joints"] for joint in finger)
-        spec = cls(
-            name=folder.name,
-            side=config["side"],
-            palm=config["palm"],
-            joints=_tree_order(config["palm"], [_joint(joint) for joint in urdf.joints]),
-            joint_names=joint_names,
-            link_names=(),
-            inertias={link.name: _inertia(link.inertial) for link in urdf.links if link.inertial is not None},
-            primitives=tuple(
-                _primitive(link, shape) for link, shapes in config["primitives"].items() for shape in shapes
-            ),
-            pads={
-                finger: Pad(pad["link"], np.array(pad["point"], float), np.array(pad["normal"], float))
-                for finger, pad in config.get("pads", {}).items()
-            },
-            exclude=tuple((a, b) for a, b in config.get("exclude", [])),
-        )
-        spec = _with(spec, link_names=(spec.palm, *(joint.child for joint in spec.joints)))
-        _check(spec, folder / "hand.yaml")
-        if side != spec.side:
-            if "mirror" not in config:
-                raise ValueError(f"hand {folder.name} has no {side} side: {folder / 'hand.yaml'} has no entry mirror")
-            spec = _mirrored(spec, side, config["mirror"])
-        return spec
-
-    @property
-    def freedoms(self) -> tuple[str, ...]:
-        """Names of the joints that move by themselves, in posture order."""
-        free = {joint.name for joint in self.joints if joint.mimic is None}
-        return tuple(name for name in self.joint_names if name in free)
-
-    def joint(self, name: str) -> Joint:
-        """The joint of that name."""
-        return next(joint for joint in self.joints if joint.name == name)
-
-
-def _with(spec: HandSpec, **changes: Any) -> HandSpec:
-    return HandSpec(**{**spec.__dict__, **changes})
-
-
-def _joint(joint: yourdfpy.Joint) -> Joint:
-    moves = joint.type in ("revolute", "continuous")
-    if not moves and joint.type != "fixed":
-        raise ValueError(f"joint {joint.name} is {joint.type}; only revolute and fixed joints are supported")
-    limit, mimic, dynamics = joint.limit, joint.mimic, joint.dynamics
-    if moves and limit is None:
-        raise ValueError(f"joint {joint.name} has no <limit>")
-    return Joint(
-        name=joint.name,
-        parent=joint.parent,
-        child=joint.child,
-        origin=np.eye(4) if joint.origin is None else np.asarray(joint.origin, float),
-        axis=np.asarray(joint.axis, float) / np.linalg.norm(joint.axis) if moves else None,
-        lower=limit.lower or 0.0 if moves else 0.0,
-        upper=limit.upper or 0.0 if moves else 0.0,
-        effort=limit.effort or 0.0 if moves else 0.0,
-        damping=(dynamics.damping or 0.0) if dynamics else 0.0,
-        mimic=mimic.joint if mimic else None,
-        multiplier=1.0 if mimic is None or mimic.multiplier is None else mimic.multiplier,
-        offset=0.0 if mimic is None or mimic.offset is None else mimic.offset,
-    )
-
-
-def _inertia(inertial: yourdfpy.Inertial) -> Inertia:
-    origin = np.eye(4) if inertial.origin is None else np.asarray(inertial.origin, float)
-    turn = origin[:3, :3]
-    return Inertia(float(inertial.mass), origin[:3, 3], turn @ np.asarray(inertial.inertia, float) @ turn.T)
-
-
-def _primitive(link: str, shape: dict[str, Any]) -> Primitive:
-    pose = np.eye(4)
-    if "box" in shape:
-        pose[:3, 3] = shape["box"]["center"]
-        return Primitive(link, pose, np.array(shape["box"]["half"], float), 0.0)
-    if "capsule" in shape:
-        start, end = (np.array(shape["capsule"][key], float) for key in ("from", "to"))
-        length = float(np.linalg.norm(end - start))
-        x = (end - start) / length
-        y = np.cross(np.eye(3)[np.abs(x).argmin()], x)
-        y /= np.linalg.norm(y)
-        pose[:3, :3] = np.column_stack((x, y, np.cross(x, y)))
-        pose[:3, 3] = (start + end) / 2
-        return Primitive(link, pose, np.array([length / 2, 0, 0]), float(shape["capsule"]["radius"]))
-    raise ValueError(f"primitive of link {link} is {', '.join(shape)}; use capsule or box")
-
-
-def _tree_order(root: str, joints: list[Joint]) -> tuple[Joint, ...]:
-    ordered: list[Joint] = []
-    stack = [root]
-    while stack:
-        children = [joint for joint in joints if joint.parent == stack[-1]]
-        link = stack.pop()
-        incoming = [joint for joint in joints if joint.child == link]
-        ordered.extend(incoming if link != root else [])
-        stack.extend(joint.child for joint in reversed(children))
-    if len(ordered) != len(joints):
-        lost = {joint.name for joint in joints} - {joint.name for joint in ordered}
-        raise ValueError(f"the URDF's joints {', '.join(sorted(lost))} are not reached from the palm link {root}")
-    return tuple(ordered)
-
-
-def _check(spec: HandSpec, path: Path) -> None:
-    moving = {joint.name for joint in spec.joints if joint.axis is not None}
-    if len(set(spec.joint_names)) != len(spec.joint_names) or set(spec.joint_names) != moving:
-        odd = moving.symmetric_difference(spec.joint_names) or set(spec.joint_names)
-        raise ValueError(f"{path}: joints and the URDF's moving joints differ in {', '.join(sorted(odd))}")
-    for joint in spec.joints:
-        if joint.mimic is not None and joint.mimic not in moving:
-            raise ValueError(f"{path}: joint {joint.name} is coupled to {joint.mimic}, which does not exist")
-    used = {p.link for p in spec.primitives} | {p.link for p in spec.pads.values()} | {n for e in spec.exclude for n in e}
-    for link in sorted(used - set(spec.link_names)):
-        near = difflib.get_close_matches(link, spec.link_names, 1)
-        raise ValueError(f"{path}: link {link} is not in the URDF" + (f", did you mean {near[0]}?" if near else ""))
-
-
-def _mirrored(spec: HandSpec, side: Side, axes: dict[str, str]) -> HandSpec:
-    """The other side's hand: each link's frame mirrored along its own axis, so that joint axes and limits stay."""
-    flip = {link: np.array(_MIRROR[axes.get(link, "z")]) for link in spec.link_names}
-
-    def mirror(parent: np.ndarray, pose: np.ndarray, child: np.ndarray) -> np.ndarray:
-        return np.diag([*parent, 1.0]) @ pose @ np.diag([*child, 1.0])
-
-    def turn(joint: Joint) -> Joint:
-        return Joint(**{**joint.__dict__, "origin": mirror(flip[joint.parent], joint.origin, flip[joint.child])})
-
-    return _with(
-        spec,
-        side=side,
-        joints=tuple(turn(joint) for joint in spec.joints),
-        inertias={
-            link: Inertia(i.mass, flip[link] * i.center, np.outer(flip[link], flip[link]) * i.matrix)
-            for link, i in spec.inertias.items()
-        },
-        # a rounded box is its own mirror image along its third axis
-        primitives=tuple(
-            Primitive(p.link, mirror(flip[p.link], p.pose, np.array(_MIRROR["z"])), p.half, p.radius)
-            for p in spec.primitives
-        ),
-        pads={f: Pad(p.link, flip[p.link] * p.point, flip[p.link] * p.normal) for f, p in spec.pads.items()},
-    )
+__all__ = ["Hand", "HandSpec", "Inertia", "Joint", "Pad", "Primitive", "Side", "default_hand"]
 
 
 class Hand(nn.Module):
@@ -251,7 +24,7 @@ class Hand(nn.Module):
 
     joint_names: the 20 joints in posture order; freedoms: the 15 that move by themselves.
     link_names: the links in the order of `forward_kinematics`; solid_names: those with a shape, in the order of
-    `signed_distance`.
+    `signed_distance`; shapes: the primitives in the order of `shape_poses`.
     """
 
     lower: Tensor
@@ -303,12 +76,13 @@ class Hand(nn.Module):
             before = {joint.child: i for i, joint in enumerate(level)}
             order += [joint.child for joint in level]
         self._unsort = [order.index(name) for name in self.link_names]
-        self._constants: dict[tuple[torch.dtype, torch.device], tuple[Tensor, ...]] = {}
+        self._constants: dict[tuple[torch.device, torch.dtype], tuple[Tensor, ...]] = {}
 
     def _prepare_shapes(self) -> None:
-        shapes = self.spec.primitives
-        self.solid_names = [name for name in self.link_names if any(shape.link == name for shape in shapes)]
-        shapes = tuple(sorted(shapes, key=lambda shape: self.solid_names.index(shape.link)))
+        solid_links = {shape.link for shape in self.spec.primitives}
+        self.solid_names = [name for name in self.link_names if name in solid_links]
+        shapes = sorted(self.spec.primitives, key=lambda shape: self.solid_names.index(shape.link))
+        self.shapes = shapes
         self._shape_link = [self.link_names.index(shape.link) for shape in shapes]
         solid = [self.solid_names.index(shape.link) for shape in shapes]
         self._shape_groups = [[i for i, s in enumerate(solid) if s == k] for k in range(len(self.solid_names))]
@@ -318,11 +92,12 @@ class Hand(nn.Module):
 
     def _cast(self, like: Tensor) -> tuple[Tensor, ...]:
         """Every constant in the dtype and on the device of a tensor, kept for the next call."""
-        key = (like.dtype, like.device)
+        key = (like.device, like.dtype)
         if key not in self._constants:
             constants = [level[2] for level in self._levels]
             constants += [self._expand, self._expand_offset, self._shape_pose, self._shape_half, self._shape_radius]
-            self._constants[key] = tuple(value.to(like) for value in constants)
+            with torch.inference_mode(False):  # else a first call in inference mode would bar gradients from then on
+                self._constants[key] = tuple(value.to(*key) for value in constants)
         return self._constants[key]
 
     def expand(self, q15: Float[Tensor, "*batch freedom"]) -> Float[Tensor, "*batch joint"]:
@@ -380,11 +155,11 @@ class Hand(nn.Module):
         return links[..., self._shape_link, :, :] @ self._cast(links)[-3]
 
     def signed_distance(
-        self, links: Float[Tensor, "*batch link 4 4"], points: Float[Tensor, "*batch point 3"]
-    ) -> Float[Tensor, "*batch solid point"]:
+        self, links: Float[Tensor, "*batch link 4 4"], points: Float[Tensor, "*cloud point 3"]
+    ) -> Float[Tensor, "*both solid point"]:
         """Distance in metres from points to the surface of each solid link, negative inside.
 
-        links: link poses in the frame of the points. points broadcast against the batch. Exact for capsules and
+        links: link poses in the frame of the points. points broadcast against the poses. Exact for capsules and
         boxes; where several primitives make one link, the nearest counts.
         """
         poses = self.shape_poses(links)
@@ -400,10 +175,10 @@ class Hand(nn.Module):
 
     def clearance(
         self, links: Float[Tensor, "*batch link 4 4"], plane: Float[Tensor, "*plane 4"]
-    ) -> Float[Tensor, "*batch solid"]:
+    ) -> Float[Tensor, "*both solid"]:
         """Smallest height in metres of each solid link over a plane (normal . p + offset), negative below it.
 
-        plane: unit normal and offset in the frame of the link poses; broadcasts against the batch.
+        plane: unit normal and offset in the frame of the link poses; broadcasts against them.
         """
         poses = self.shape_poses(links)
         half, radius = self._cast(links)[-2:]
@@ -414,7 +189,7 @@ class Hand(nn.Module):
         return torch.stack([low[..., group].amin(-1) for group in self._shape_groups], dim=-1)
 
 
-def _joint_terms(joint: Joint) -> np.ndarray:
+def _joint_terms(joint: Joint) -> NDArray[np.float64]:
     """(3, 4, 4): the constant, sine and 1 - cosine terms of a joint's transform."""
     zero = np.zeros((4, 4))
     if joint.axis is None:

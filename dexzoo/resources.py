@@ -8,6 +8,10 @@ _PACKAGE = Path(__file__).parent
 
 
 def resource(name: str) -> Path:
-    """The folder `name`: inside an installed package, or beside it in a source tree."""
+    """The folder `name`: inside an installed package, or in a source tree beside the package or in its assets."""
     inside = _PACKAGE / "resources" / name
-    return inside if inside.exists() else _PACKAGE.parent / name
+    if inside.exists():
+        return inside
+    beside = _PACKAGE.parent / name
+    asset = _PACKAGE.parent / "assets" / name
+    return asset if asset.exists() and not beside.exists() else beside

@@ -41,10 +41,9 @@ def conjugate(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"
 
 def rotate(quaternion: Float[Tensor, "... 4"], vector: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
     """Rotate vectors by unit quaternions; the leading dimensions broadcast."""
-    w, u = quaternion[..., :1], quaternion[..., 1:]
-    u, vector = torch.broadcast_tensors(u, vector)
-    twice = 2.0 * torch.linalg.cross(u, vector, dim=-1)
-    return vector + w * twice + torch.linalg.cross(u, twice, dim=-1)
+    u, vector = torch.broadcast_tensors(quaternion[..., 1:], vector)
+    twice = 2.0 * torch.cross(u, vector, dim=-1)
+    return vector + quaternion[..., :1] * twice + torch.cross(u, twice, dim=-1)
 
 
 def to_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
@@ -55,7 +54,7 @@ def to_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     )  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    return torch.stack(rows, dim=-1).reshape(*w.shape, 3, 3)
 
 
 def from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
@@ -112,20 +111,19 @@ def log(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
     return scale * u
 
 
-def angle(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"]) -> Float[Tensor, "..."]:
+def angle(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"]) -> Float[Tensor, "*batch"]:
     """The angle between two rotations, radians in [0, pi]."""
-    return log(multiply(conjugate(a), b)).norm(dim=-1)
+    radians: Tensor = log(multiply(conjugate(a), b)).norm(dim=-1)
+    return radians
 
 
-def slerp(
-    a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"], t: Float[Tensor, "..."]
-) -> Float[Tensor, "... 4"]:
+def slerp(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"], t: Float[Tensor, "*step"]) -> Float[Tensor, "... 4"]:
     """The rotation a fraction t of the shortest way from a to b (Shoemake 1985)."""
     step = log(multiply(conjugate(a), b))
     return normalize(multiply(a, exp(t[..., None] * step)))
 
 
-def from_axis_angle(axis: Float[Tensor, "... 3"], radians: Float[Tensor, "..."]) -> Float[Tensor, "... 4"]:
+def from_axis_angle(axis: Float[Tensor, "... 3"], radians: Float[Tensor, "*angle"]) -> Float[Tensor, "... 4"]:
     """The rotation by `radians` about the unit vector `axis`."""
     return exp(axis * radians[..., None])
 

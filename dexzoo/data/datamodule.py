@@ -1,0 +1,231 @@
+"""A grasp set as batches."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import sys
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from lightning.pytorch import LightningDataModule
+from rich.progress import track
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler, SequentialSampler, WeightedRandomSampler
+
+from dexzoo.data.schema import SPLITS, TABLES, VERSION, GraspSet
+from dexzoo.grasp import transform_waypoints
+from dexzoo.models.evaluator import Batch, GraspEvaluator, Scene
+from dexzoo.resources import resource
+
+VIEWS_PER_FILE = 64
+"""Views that are encoded and cached together; a grown set keeps the files of its old views."""
+STATISTICS_VIEWS = 256
+"""Training views that the image statistics are taken from, evenly spaced."""
+
+_log = logging.getLogger(__name__)
+
+
+class GraspDataset(Dataset[Batch]):
+    """Whole batches by lists of indices: gathers from tensors, no work by row.
+
+    view: (num_grasps,) row of each grasp's view in `scene`, or, without one, in the set's table of views.
+    """
+
+    def __init__(
+        self, grasps: Tensor, success: Tensor, scene_index: Tensor, view: Tensor, scene: Scene | None, source: GraspSet
+    ) -> None:
+        self.grasps, self.success, self.scene_index = grasps, success, scene_index
+        self.view, self.scene, self.source = view, scene, source
+
+    def __len__(self) -> int:
+        return len(self.grasps)
+
+    def __getitem__(self, index: list[int]) -> Batch:
+        rows = torch.tensor(index)
+        view = self.view[rows]
+        views: Scene | Tensor
+        if self.scene is None:
+            shown, place = view.unique(return_inverse=True)
+            views = torch.stack([self.source.observation(int(row)).image() for row in shown])[place]
+        else:
+            views = {name: value[view] for name, value in self.scene.items()}
+        return Batch(views, self.grasps[rows, None], self.success[rows], self.scene_index[rows])
+
+
+class GraspDataModule(LightningDataModule):
+    """Batches of a grasp set, split by object as the set itself says.
+
+    folder: the set (`dexzoo.data.schema`); a relative one is looked up in the working folder, then beside the package.
+    batch_size: grasps in a batch; training draws as many successes as failures, with replacement.
+    predict_split: the split that `predict` runs over.
+    cache: where encoded views are kept; by default the user's cache folder.
+    seed: of the drawing.
+
+    Evaluators with a frozen encoder see each view once, ever: its encoding is kept on disk under a name made from the
+    view's bytes and from what the encoder makes of a probe image. Raises FileNotFoundError or ValueError where the set
+    cannot be read or a split is empty.
+    """
+
+    def __init__(
+        self,
+        folder: str = "assets/grasps",
+        batch_size: int = 64,
+        predict_split: str = "test",
+        cache: str | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if predict_split not in SPLITS:
+            raise ValueError(f"predict_split {predict_split!r} is unknown; use one of {', '.join(SPLITS)}")
+        if batch_size < 1:
+            raise ValueError(f"batch_size is {batch_size}, expected at least 1")
+        beside = resource(folder)
+        self.folder = beside if beside.exists() and not Path(folder).exists() else Path(folder)
+        self.batch_size, self.predict_split, self.seed = batch_size, predict_split, seed
+        self.cache = Path(cache) if cache else _user_cache()
+
+    @cached_property
+    def source(self) -> GraspSet:
+        """The set, read into memory."""
+        return GraspSet(self.folder)
+
+    @cached_property
+    def waypoints(self) -> Tensor:
+        """(num_grasps, 10, 28) all grasps, each in the frame of the aimed camera of its view."""
+        T_camera_world = torch.linalg.inv(self.source.camera_poses.double()).float()
+        return transform_waypoints(T_camera_world[self.source.grasp_view], self.source.world_grasps.waypoints)
+
+    def setup(self, stage: str) -> None:
+        """Before fitting, give the model the statistics of the training data."""
+        if stage == "fit":
+            self.fit_statistics(self._model)
+
+    def fit_statistics(self, model: GraspEvaluator) -> None:
+        """Set the model's standardisation from the training split."""
+        views = np.flatnonzero(self.source.view_split == SPLITS.index("train"))
+        views = views[np.linspace(0, len(views) - 1, min(len(views), STATISTICS_VIEWS)).astype(int)]
+        rows = self._rows("train")
+        images = torch.stack([self.source.observation(int(view)).image() for view in views])
+        model.fit_statistics(images.to(model.device), self.waypoints[rows].to(model.device))
+
+    def dataset(self, split: str, model: GraspEvaluator) -> GraspDataset:
+        """The grasps of a split, with their views encoded by the model where its encoder is frozen."""
+        rows = self._rows(split)
+        view = torch.from_numpy(self.source.grasp_view)[rows]
+        scene = None
+        if model.frozen_encoder:
+            shown, view = view.unique(return_inverse=True)
+            scene = self._encode(shown.tolist(), model)
+        return GraspDataset(
+            self.waypoints[rows],
+            torch.from_numpy(self.source.success).float()[rows],
+            torch.from_numpy(self.source.grasp_scene)[rows],
+            view,
+            scene,
+            self.source,
+        )
+
+    def loader(self, dataset: GraspDataset, *, balanced: bool = False) -> DataLoader[Batch]:
+        """Batches of a dataset, in order, or drawn with as many successes as failures."""
+        sampler: Sampler[int] = SequentialSampler(dataset)
+        if balanced:
+            count = torch.bincount(dataset.success.long(), minlength=2)
+            if not count.all():
+                raise ValueError(f"grasp set {self.folder}: training needs both successes and failures")
+            generator = torch.Generator().manual_seed(self.seed)
+            weights = (1 / count)[dataset.success.long()]
+            sampler = WeightedRandomSampler(weights.tolist(), len(dataset), generator=generator)
+        return DataLoader(dataset, sampler=BatchSampler(sampler, self.batch_size, drop_last=False), batch_size=None)
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        """Balanced batches of the training split."""
+        return self.loader(self.dataset("train", self._model), balanced=True)
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        """The validation split."""
+        return self.loader(self.dataset("validation", self._model))
+
+    def test_dataloader(self) -> DataLoader[Batch]:
+        """The test split: objects that neither training nor selection has seen."""
+        return self.loader(self.dataset("test", self._model))
+
+    def predict_dataloader(self) -> DataLoader[Batch]:
+        """The split named `predict_split`."""
+        return self.loader(self.dataset(self.predict_split, self._model))
+
+    def describe(self) -> dict[str, str | int]:
+        """What a model card says of the data: format version, number of training grasps, hash of the tables."""
+        digest = hashlib.sha256()
+        for name in TABLES:
+            digest.update((self.folder / f"{name}.parquet").read_bytes())
+        return {"version": VERSION, "train_grasps": len(self._rows("train")), "sha256": digest.hexdigest()}
+
+    @property
+    def _model(self) -> GraspEvaluator:
+        model = self.trainer.lightning_module if self.trainer else None
+        if not isinstance(model, GraspEvaluator):
+            raise ValueError(
+                "GraspDataModule needs a Trainer with a GraspEvaluator; without, use dataset() and loader()"
+            )
+        return model
+
+    def _rows(self, split: str) -> Tensor:
+        rows = np.flatnonzero(self.source.grasp_split == SPLITS.index(split))
+        if not len(rows):
+            raise ValueError(f"grasp set {self.folder} has no grasps in its {split} split; collect more objects")
+        return torch.from_numpy(rows)
+
+    def _encode(self, rows: list[int], model: GraspEvaluator) -> Scene:
+        """The encoded views of some rows of the table of views, float16, from the cache where it has them."""
+        folder = self.cache / "views" / _fingerprint(model)
+        starts = range(0, len(rows), VIEWS_PER_FILE)
+        parts = []
+        for start in track(starts, "encoding views", transient=True, disable=not sys.stderr.isatty()):
+            parts.append(self._encode_part(rows[start : start + VIEWS_PER_FILE], model, folder))
+        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+    def _encode_part(self, rows: list[int], model: GraspEvaluator, folder: Path) -> Scene:
+        table = self.source.views.take(rows)
+        digest = hashlib.sha256()
+        for depth in table["depth"].to_pylist():
+            digest.update(depth)
+        digest.update(np.array(table["T_world_camera"].to_pylist()).tobytes())
+        path = folder / f"{digest.hexdigest()[:32]}.safetensors"
+        try:
+            return load_file(path)
+        except FileNotFoundError:
+            pass
+        except SafetensorError:
+            _log.warning("cached views %s cannot be read; encoding them again", path)
+        images = torch.stack([self.source.observation(row).image() for row in rows])
+        with torch.no_grad():
+            encoded = [model.encode(part.to(model.device)) for part in images.split(16)]
+        scene = {name: torch.cat([part[name] for part in encoded]).cpu().half() for name in encoded[0]}
+        folder.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}")
+        save_file(scene, temporary)
+        temporary.rename(path)
+        return scene
+
+
+def _user_cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dexzoo"
+
+
+def _fingerprint(model: GraspEvaluator) -> str:
+    """A name for an encoder that changes with its weights, its statistics and its code."""
+    row, column = torch.meshgrid(torch.arange(224.0), torch.arange(224.0), indexing="ij")
+    bump = 70**2 - (row - 112) ** 2 - (column - 112) ** 2
+    probe = torch.stack((0.6 - bump.clamp_min(0).sqrt() / 1000, 0.1 + row / 2000)) * (bump > 0)
+    with torch.no_grad():
+        encoded = model.encode(probe[None].to(model.device))
+    digest = hashlib.sha256(model.architecture.encode())
+    for name, value in sorted(encoded.items()):
+        digest.update(name.encode() + value.cpu().contiguous().numpy().tobytes())
+    return f"{model.architecture}-{digest.hexdigest()[:16]}"

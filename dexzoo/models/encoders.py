@@ -1,0 +1,148 @@
+"""What evaluators see: VGG-16 on the colourised depth image, and a grasp as 280 standardised numbers."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchvision.models import VGG16_Weights, vgg16
+
+from dexzoo import rotation
+from dexzoo.camera import colourise
+from dexzoo.grasp import NUM_TYPES, NUM_WAYPOINTS, QUATERNION, TYPE, WAYPOINT_SIZE
+from dexzoo.resources import resource
+
+TRUNK_SCALE = {"hed": 60.0, "imagenet": 1.0}
+"""Trunks by name, with the standard deviation of the images each was trained on."""
+VECTOR_SIZE = NUM_TYPES + NUM_WAYPOINTS * (WAYPOINT_SIZE - 1)
+"""A grasp as a vector: ten numbers of the type, then 27 for each of ten waypoints; 280."""
+CLIP = 3.0
+MIN_STD = 1e-6
+
+
+@lru_cache(maxsize=2)
+def load_trunk(name: str) -> nn.Sequential:
+    """VGG-16's 13 convolutions with their poolings, frozen; one copy of each is shared by all models.
+
+    name: "hed", shipped, ImageNet weights fine-tuned for edge detection (Xie and Tu 2015); "imagenet", fetched by
+    torchvision. Raises ValueError for another name, FileNotFoundError where weights cannot be had.
+    """
+    if name == "hed":
+        path = resource("checkpoints") / "vgg16_hed.safetensors"
+        if not path.is_file():
+            raise FileNotFoundError(f"trunk weights {path} are missing; reinstall dexzoo or run convert_hed.py")
+        weights = load_file(path)
+    elif name == "imagenet":
+        try:
+            weights = VGG16_Weights.IMAGENET1K_V1.get_state_dict(progress=False, check_hash=True, weights_only=True)
+        except OSError as error:
+            raise FileNotFoundError(f'trunk "imagenet" cannot be fetched ({error}); use the shipped "hed"') from None
+        prefix = "features."
+        weights = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
+    else:
+        raise ValueError(f"trunk {name!r} is unknown; use one of {', '.join(TRUNK_SCALE)}")
+    with torch.device("meta"):  # torchvision would draw 138 million random weights that nobody needs
+        trunk: nn.Sequential = vgg16(weights=None).features
+    trunk.load_state_dict({key: value.float() for key, value in weights.items()}, assign=True)
+    trunk.requires_grad_(False)
+    return trunk.to(memory_format=torch.channels_last).eval()
+
+
+class DepthEncoder(nn.Module):
+    """Depth image -> feature map of a frozen VGG-16, which runs in bfloat16.
+
+    The colourised depth is standardised by channel, with mean and standard deviation over the object pixels of the
+    training views, and clipped to three standard deviations: that puts the background, of depth 0, at -3. The thesis
+    standardises each pixel by itself; with hundreds of views instead of hundreds of thousands a pixel that few objects
+    reach has next to no variance, and its standardised values explode. Images are brought to the scale that the
+    trunk was trained on, and features back by the same factor, so that they are of the order of one.
+
+    The trunk is not a submodule: it is neither trained, averaged nor saved, only shared.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, trunk: str = "hed") -> None:
+        super().__init__()
+        if trunk not in TRUNK_SCALE:
+            raise ValueError(f"trunk {trunk!r} is unknown; use one of {', '.join(TRUNK_SCALE)}")
+        self.trunk = trunk
+        self.register_buffer("mean", torch.tensor([0.57, 0.0, 0.0]))
+        self.register_buffer("std", torch.tensor([0.1, 0.03, 0.03]))
+
+    def fit_statistics(self, images: Float[Tensor, "view 2 224 224"]) -> None:
+        """Set mean and standard deviation from training views."""
+        channels = colourise(images[:, 0])
+        pixels = channels.movedim(1, -1)[images[:, 0] > 0].double()
+        if not len(pixels):
+            raise ValueError("the training views show no object: all depths are 0")
+        self.mean.copy_(pixels.mean(0))
+        self.std.copy_(pixels.std(0).clamp_min(MIN_STD))
+
+    @torch.no_grad()
+    def forward(self, images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view 512 14 14"]:
+        """The last convolution's features, after its ReLU and before the last pooling."""
+        trunk = load_trunk(self.trunk).to(images.device)
+        scale = TRUNK_SCALE[self.trunk]
+        x = (colourise(images[:, 0].float()) - self.mean[:, None, None].float()) / self.std[:, None, None].float()
+        x = (scale * x.clamp(-CLIP, CLIP)).contiguous(memory_format=torch.channels_last)
+        with torch.autocast(images.device.type, torch.bfloat16):
+            features: Tensor = trunk[:-1](x)
+        return (features.float() / scale).contiguous()
+
+
+class GraspVector(nn.Module):
+    """A grasp as 280 numbers: the type as one of ten, then 27 for each waypoint, standardised index by index.
+
+    The 27 are position, quaternion (wxyz, w >= 0) and the 20 joints. An index that does not vary in the training data
+    is only shifted.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(VECTOR_SIZE))
+        self.register_buffer("std", torch.ones(VECTOR_SIZE))
+
+    def fit_statistics(self, waypoints: Float[Tensor, "grasp 10 28"]) -> None:
+        """Set mean and standard deviation from training grasps in the camera frame."""
+        vectors = self.flatten(waypoints).double()
+        std = vectors.std(0)
+        self.mean.copy_(vectors.mean(0))
+        self.std.copy_(torch.where(std > MIN_STD, std, 1.0))
+
+    @staticmethod
+    def flatten(waypoints: Float[Tensor, "*batch 10 28"]) -> Float[Tensor, "*batch 280"]:
+        """The 280 numbers before standardisation."""
+        kind = F.one_hot(waypoints[..., 0, TYPE].detach().round().long(), NUM_TYPES).to(waypoints)
+        quaternion = rotation.normalize(waypoints[..., QUATERNION])
+        path = torch.cat((waypoints[..., :3], quaternion, waypoints[..., 7:TYPE]), dim=-1)
+        return torch.cat((kind, path.flatten(-2)), dim=-1)
+
+    def forward(self, waypoints: Float[Tensor, "*batch 10 28"]) -> Float[Tensor, "*batch 280"]:
+        """The 280 standardised numbers."""
+        return (self.flatten(waypoints) - self.mean) / self.std
+
+
+def initialise(module: nn.Module) -> None:
+    """Xavier's uniform weights and zero biases in every linear layer and convolution (Glorot and Bengio 2010)."""
+    for layer in module.modules():
+        if isinstance(layer, (nn.Linear, nn.Conv1d, nn.Conv2d)):
+            nn.init.xavier_uniform_(layer.weight)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+
+
+def dense(size: int, width: int, dropout: float, depth: int = 1) -> list[nn.Module]:
+    """Fully connected layers of `width`, each with ReLU and dropout."""
+    layers: list[nn.Module] = []
+    for before in [size, *[width] * (depth - 1)]:
+        layers += [nn.Linear(before, width), nn.ReLU(), nn.Dropout(dropout)]
+    return layers

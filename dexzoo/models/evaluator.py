@@ -1,0 +1,249 @@
+"""The one interface of all evaluative models: an image and grasps in, log-odds of success out."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, TypedDict
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import Callback, LightningModule
+from lightning.pytorch.trainer.states import TrainerFn
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn import functional as F
+from torchmetrics import MetricCollection
+from torchmetrics.classification import BinaryAccuracy, BinaryAUROC, BinaryAveragePrecision
+
+from dexzoo.camera import Observation
+from dexzoo.grasp import NUM_TYPES, Grasps, transform_waypoints
+from dexzoo.metrics import TopKSuccess
+from dexzoo.models.averaging import MovingAverage
+
+CARD_FORMAT = "dexzoo.evaluator.1"
+OPTIMIZERS = ("sgd", "adamw")
+CHUNK = 512
+"""Grasps scored at once; bounds memory."""
+
+Scene = dict[str, Tensor]
+"""What an architecture keeps of its views: tensors whose first dimension is the view."""
+
+
+class Batch(NamedTuple):
+    """Grasps with the view each is paired with; the first dimension of all is the grasp.
+
+    views: the encoded views, or, where the encoder is trained, their images (batch, 2, 224, 224).
+    grasps: (batch, 1, 10, 28) waypoints in the frame of the view's aimed camera.
+    success: (batch,) 0 or 1. scene_index: (batch,) which scene of the set.
+    """
+
+    views: Scene | Tensor
+    grasps: Tensor
+    success: Tensor
+    scene_index: Tensor
+
+
+class TrainingOptions(TypedDict, total=False):
+    """The arguments that every architecture hands on to `GraspEvaluator`."""
+
+    optimizer: str
+    learning_rate: float
+    weight_decay: float
+    average_decay: float
+
+
+@dataclass(frozen=True)
+class PreparedView:
+    """One observation, encoded once, ready to score any number of grasps.
+
+    T_aimed_world: (4, 4), world frame to the frame of the aimed camera.
+    """
+
+    evaluator: GraspEvaluator
+    scene: Scene
+    T_aimed_world: Float[Tensor, "4 4"]
+
+    def logit(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
+        """Log-odds of success of grasps in the world frame; differentiable."""
+        aimed = transform_waypoints(self.T_aimed_world.to(waypoints), waypoints)
+        return self.evaluator.logit(self.scene, aimed[None])[0]
+
+
+class GraspEvaluator(LightningModule):
+    """Base of all evaluative models. An architecture adds its constructor, `encode` and `logit`.
+
+    Arguments of constructors are plain str, int, float, bool or list, and kept in attributes of the same name.
+
+    optimizer: "sgd" or "adamw". learning_rate, weight_decay: its settings.
+    average_decay: decay of the moving average of the weights, which is what is validated and saved.
+    """
+
+    architecture: ClassVar[str]
+    frozen_encoder: ClassVar[bool] = False
+    """Whether `encode` has nothing to train, so that its result can be kept for the next epoch and on disk."""
+
+    def __init__(
+        self,
+        optimizer: str = "sgd",
+        learning_rate: float = 0.001,
+        weight_decay: float = 0.0,
+        average_decay: float = 0.999,
+    ) -> None:
+        super().__init__()
+        if optimizer not in OPTIMIZERS:
+            raise ValueError(f"optimizer {optimizer!r} is unknown; use one of {', '.join(OPTIMIZERS)}")
+        self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
+        self.average_decay = average_decay
+        metrics = MetricCollection(
+            {
+                "accuracy": BinaryAccuracy(),
+                "auroc": BinaryAUROC(),
+                "average_precision": BinaryAveragePrecision(),
+                "top1": TopKSuccess(1),
+            }
+        )
+        self.metrics = torch.nn.ModuleDict(
+            {stage: metrics.clone(prefix=f"{stage}_") for stage in ("validation", "test")}
+        )
+
+    def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
+        """What is kept of each view.
+
+        images: `Observation.aimed().image()`, the object's depth and height over the table in metres, 0 elsewhere.
+        """
+        raise NotImplementedError
+
+    def logit(self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]) -> Float[Tensor, "view grasp"]:
+        """Log-odds of success, differentiable in the grasps, which are in the frame of the view's aimed camera."""
+        raise NotImplementedError
+
+    def fit_statistics(self, images: Float[Tensor, "view 2 224 224"], waypoints: Float[Tensor, "grasp 10 28"]) -> None:
+        """Set what is standardised by the training data; called once, before training. Nothing by default."""
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The constructor's arguments, from which the same architecture can be made again."""
+        classes = [cls for cls in type(self).__mro__ if issubclass(cls, GraspEvaluator) and "__init__" in cls.__dict__]
+        kinds = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        return {
+            name: getattr(self, name)
+            for cls in classes
+            for name, parameter in inspect.signature(cls.__init__).parameters.items()
+            if name != "self" and parameter.kind not in kinds
+        }
+
+    # scoring
+
+    def prepare(self, observation: Observation) -> PreparedView:
+        """Encode an observation once. Any observation will do: it is aimed at the object first."""
+        aimed = observation.aimed()
+        with torch.no_grad():
+            scene = self.encode(aimed.image()[None].to(self.device))
+        T_aimed_world = torch.linalg.inv(torch.from_numpy(aimed.T_world_camera))
+        return PreparedView(self, scene, T_aimed_world.to(self.device))
+
+    @torch.no_grad()
+    def score(self, observation: Observation, grasps: Grasps) -> Float[Tensor, " grasp"]:
+        """Probability of success of each grasp, (num_grasps,), on the evaluator's device.
+
+        observation: any view of the object; grasps: in the world frame or in that of the observation's camera.
+        Dropout is off whatever the module's mode. Raises ValueError for grasp types outside 0...9.
+        """
+        odd = [kind for kind in grasps.grasp_type.unique().tolist() if not 0 <= kind < NUM_TYPES]
+        if odd:
+            raise ValueError(f"grasp type {odd[0]} is unknown, expected 0 to {NUM_TYPES - 1}")
+        training = self.training
+        self.eval()
+        try:
+            prepared = self.prepare(observation)
+            world = grasps.to_frame("world", observation.T_world_camera).waypoints.to(self.device)
+            logits = [prepared.logit(part) for part in world.split(CHUNK)] if len(world) else [world.new_zeros(0)]
+            return torch.sigmoid(torch.cat(logits))
+        finally:
+            self.train(training)
+
+    # training
+
+    def _step(self, batch: Batch, stage: str) -> Tensor:
+        """Loss and metrics of one batch.
+
+        The loss is the softmax cross-entropy over {fail, success}. With two outputs l0, l1 it equals the binary
+        cross-entropy with logits of the log-odds l1 - l0, which serves architectures with one output as well.
+        """
+        scene = self.encode(batch.views) if isinstance(batch.views, Tensor) else batch.views
+        logit = self.logit(scene, batch.grasps)[:, 0].float()
+        loss = F.binary_cross_entropy_with_logits(logit, batch.success)
+        size = len(batch.success)
+        self.log(f"{stage}_loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=size)
+        if stage in self.metrics:
+            metrics = self.metrics[stage]
+            assert isinstance(metrics, MetricCollection)
+            metrics.update(preds=logit.sigmoid(), target=batch.success.long(), indexes=batch.scene_index)
+            self.log_dict(metrics, on_step=False, on_epoch=True, batch_size=size)
+        return loss
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The loss of a training batch."""
+        return self._step(batch, "train")
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The loss of a validation batch."""
+        return self._step(batch, "validation")
+
+    def test_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The loss of a test batch."""
+        return self._step(batch, "test")
+
+    def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Probabilities of success, (batch,)."""
+        scene = self.encode(batch.views) if isinstance(batch.views, Tensor) else batch.views
+        return self.logit(scene, batch.grasps)[:, 0].float().sigmoid()
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Stochastic gradient descent as in the thesis, or AdamW."""
+        weights = [parameter for parameter in self.parameters() if parameter.requires_grad]
+        if self.optimizer == "sgd":
+            return torch.optim.SGD(weights, lr=self.learning_rate, weight_decay=self.weight_decay)
+        return torch.optim.AdamW(weights, lr=self.learning_rate, weight_decay=self.weight_decay)
+
+    def configure_callbacks(self) -> list[Callback]:
+        """The moving average, while fitting."""
+        return [MovingAverage(self.average_decay)] if self.trainer.state.fn == TrainerFn.FITTING else []
+
+    # files
+
+    def save(self, path: str | Path, *, half: bool = True, card: Mapping[str, Any] | None = None) -> Path:
+        """Write weights and card; returns the path of the weights.
+
+        path: a folder, for NAME.safetensors and NAME.json with NAME the architecture's, or the .safetensors itself.
+        half: store the weights in float16; the statistics stay float32. The shared trunk is not stored.
+        card: what else the card shall say, such as data, metrics, seed and command.
+        """
+        path = Path(path)
+        if path.suffix != ".safetensors":
+            path = path / f"{self.architecture}.safetensors"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        trained = {name for name, _ in self.named_parameters()}
+        tensors = {
+            name: (value.half() if half and name in trained else value).detach().cpu().contiguous()
+            for name, value in self.state_dict().items()
+        }
+        temporary = path.with_name(f".{path.name}.partial")
+        save_file(tensors, temporary)
+        temporary.chmod(0o644)
+        temporary.rename(path)
+        content = {
+            "format": CARD_FORMAT,
+            "architecture": self.architecture,
+            "arguments": self.arguments,
+            "precision": "float16" if half else "float32",
+            **(card or {}),
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        }
+        path.with_suffix(".json").write_text(json.dumps(content, indent=2) + "\n")
+        return path

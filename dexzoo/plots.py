@@ -1,0 +1,140 @@
+"""Pictures: meshes shaded by ray casting (no graphics card needed), hands over depth images, grids of pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+from dexzoo.camera import Camera, Observation
+from dexzoo.grasp import JOINTS, Grasps, pose_matrix
+from dexzoo.hand import Hand
+
+Image = NDArray[np.uint8]
+OBJECT_COLOUR = (214, 150, 60)
+HAND_COLOUR = (70, 120, 200)
+TABLE_COLOUR = (225, 225, 220)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A mesh in the world frame and its colour (red, green, blue; 0...255)."""
+
+    mesh: trimesh.Trimesh
+    colour: tuple[int, int, int]
+
+
+def hand_solid(hand: Hand, waypoint: torch.Tensor, colour: tuple[int, int, int] = HAND_COLOUR) -> Solid:
+    """The hand's primitives at one waypoint (28,), in the waypoint's frame."""
+    waypoint = waypoint.detach().double()
+    wrist = pose_matrix(waypoint[:3], waypoint[3:7])
+    poses = (wrist @ hand.shape_poses(hand.forward_kinematics(waypoint[JOINTS]))).numpy()
+    return Solid(trimesh.util.concatenate([m.copy().apply_transform(T) for m, T in zip(_shapes(hand), poses, strict=True)]), colour)
+
+
+def _shapes(hand: Hand) -> list[trimesh.Trimesh]:
+    meshes = []
+    for primitive in hand.shapes:
+        if primitive.radius > 0:
+            capsule = trimesh.creation.capsule(2 * primitive.half[0], primitive.radius, count=[12, 12])
+            capsule.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+            meshes.append(capsule)
+        else:
+            meshes.append(trimesh.creation.box(2 * primitive.half))
+    return meshes
+
+
+def render(
+    solids: Sequence[Solid], camera: Camera, T_world_camera: NDArray[np.float64], table: bool = True
+) -> tuple[Image, NDArray[np.float64]]:
+    """An RGB picture and the depth (m, inf where nothing is hit) of solids over a table at z = 0."""
+    rays = camera.directions()
+    length = np.linalg.norm(rays, axis=-1).ravel()
+    directions = rays.reshape(-1, 3) @ T_world_camera[:3, :3].T
+    origin = T_world_camera[:3, 3]
+    colour = np.full((len(directions), 3), 255.0)
+    depth = np.full(len(directions), np.inf)
+    shade = np.ones(len(directions))
+    if table:
+        with np.errstate(divide="ignore"):
+            t = -origin[2] / directions[:, 2]
+        hit = (t > 0) & (t < 5)
+        point = origin + t[hit, None] * directions[hit]
+        squares = (np.floor(point[:, 0] / 0.1) + np.floor(point[:, 1] / 0.1)) % 2
+        depth[hit] = t[hit]
+        colour[hit] = np.array(TABLE_COLOUR) - 10 * squares[:, None]
+    mesh = trimesh.util.concatenate([solid.mesh for solid in solids])
+    faces = np.concatenate([np.full(len(solid.mesh.faces), i) for i, solid in enumerate(solids)])
+    triangle, ray, point = mesh.ray.intersects_id(
+        np.broadcast_to(origin, directions.shape), directions, multiple_hits=False, return_locations=True
+    )[:3]
+    distance = np.linalg.norm(point - origin, axis=1) / length[ray]
+    front = distance < depth[ray]
+    triangle, ray, distance = triangle[front], ray[front], distance[front]
+    depth[ray] = distance
+    colour[ray] = np.array([solid.colour for solid in solids])[faces[triangle]]
+    facing = np.abs((mesh.face_normals[triangle] * directions[ray]).sum(1)) / length[ray]
+    above = mesh.face_normals[triangle][:, 2]
+    shade[ray] = 0.35 + 0.45 * facing + 0.2 * np.clip(above, 0, 1)
+    picture = np.clip(colour * shade[:, None], 0, 255).astype(np.uint8)
+    return picture.reshape(camera.height, camera.width, 3), depth.reshape(camera.height, camera.width)
+
+
+def depth_picture(observation: Observation) -> Image:
+    """The depth image in grey: near is dark, no reading is white; the object tinted."""
+    depth = observation.depth
+    near, far = np.percentile(depth[depth > 0], [1, 99])
+    grey = np.where(depth > 0, 60 + 170 * np.clip((depth - near) / max(far - near, 1e-3), 0, 1), 255)
+    picture = np.repeat(grey[..., None], 3, axis=-1)
+    picture[observation.mask] = 0.55 * picture[observation.mask] + 0.45 * np.array(OBJECT_COLOUR)
+    return picture.astype(np.uint8)
+
+
+def overlay_hand(observation: Observation, hand: Hand, grasp: Grasps, waypoint: int) -> Image:
+    """The depth image with the hand of one grasp drawn over it at a waypoint; hidden parts faint."""
+    world = grasp.to_frame("world", observation.T_world_camera)
+    drawn, depth = render(
+        [hand_solid(hand, world.waypoints[0, waypoint])], observation.camera, observation.T_world_camera, table=False
+    )
+    picture = depth_picture(observation).astype(np.float64)
+    seen = np.isfinite(depth)
+    behind = seen & (observation.depth > 0) & (depth > observation.depth + 0.005)
+    alpha = np.where(behind, 0.25, 0.85)[..., None] * seen[..., None]
+    return np.asarray((1 - alpha) * picture + alpha * drawn, np.uint8)
+
+
+def look_at(target: NDArray[np.float64], distance: float, azimuth: float, elevation: float) -> NDArray[np.float64]:
+    """T_world_camera of an upright camera `distance` metres from a target; angles in radians."""
+    back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    right = np.cross(-back, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack((right, np.cross(-back, right), -back))
+    pose[:3, 3] = np.asarray(target) + distance * back
+    return pose
+
+
+def grid(pictures: Sequence[Image], titles: Sequence[str], columns: int) -> Image:
+    """Pictures of one size, side by side, each with its title above."""
+    cells = []
+    for picture, title in zip(pictures, titles, strict=True):
+        bar = np.full((28, picture.shape[1], 3), 255, np.uint8)
+        cv2.putText(bar, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (20, 20, 20), 1, cv2.LINE_AA)
+        cells.append(np.concatenate((bar, picture)))
+    blank = np.full_like(cells[0], 255)
+    cells += [blank] * (-len(cells) % columns)
+    rows = [np.concatenate(cells[i : i + columns], axis=1) for i in range(0, len(cells), columns)]
+    return np.concatenate(rows)
+
+
+def save(picture: Image, path: Path) -> None:
+    """Write an RGB picture as PNG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), picture[..., ::-1]):
+        raise OSError(f"picture {path} could not be written")

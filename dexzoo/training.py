@@ -1,0 +1,195 @@
+"""Training and evaluation from the command line: fit, validate, test and predict, by Lightning's own command line.
+
+The configuration is the truth and a checkpoint is weights: nothing that a checkpoint stores changes a setting.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import pickle
+import shlex
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from jsonargparse import ArgumentError
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+
+from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.models.evaluator import GraspEvaluator
+from dexzoo.models.zoo import load, load_weights
+from dexzoo.resources import resource
+
+SUBCOMMANDS = ("fit", "validate", "test", "predict")
+CONFIG_OPTIONS = ("-c", "--config")
+NOT_NEWS = (
+    ".*does not have many workers.*",  # batches are gathers from memory, workers would slow them
+    ".*args parameter is intended to run from within Python.*",  # Lightning sees ours and those of `python -m dexzoo`
+    ".*isinstance.treespec, LeafSpec.*",  # between Lightning and torch
+)
+"""Warnings of Lightning's that a user can do nothing about."""
+
+
+class CommandLine(LightningCLI):
+    """Lightning's command line, with weights from the zoo, and with export after fitting.
+
+    --ckpt_path takes a Lightning checkpoint (.ckpt, to resume or to evaluate), or anything that `zoo.load` takes: a
+    model's name, a .safetensors file or a run's folder.
+    """
+
+    def __init__(self, args: list[str], command: str) -> None:
+        self.command = command
+        # errors raised instead of printed with a page of usage, by the main parser and by each subcommand's
+        parser: dict[str, Any] = {"exit_on_error": False, "prog": "python -m dexzoo"}
+        parser |= {name: {"exit_on_error": False} for name in SUBCOMMANDS}
+        super().__init__(
+            GraspEvaluator,
+            GraspDataModule,
+            subclass_mode_model=True,
+            trainer_defaults={
+                "enable_progress_bar": sys.stderr.isatty(),
+                "enable_model_summary": False,
+                "log_every_n_steps": 1,
+            },
+            save_config_kwargs={"overwrite": True},
+            parser_kwargs=parser,
+            auto_configure_optimizers=False,
+            args=args,
+        )
+
+    def add_default_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """The arguments that all of dexzoo's commands have."""
+        parser.add_argument("--seed_everything", "--seed", type=int, default=0, help="Seed of all random numbers.")
+        parser.add_argument("--json", action="store_true", help="Write results to standard output as one JSON object.")
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        """The subcommands, with those of the trainer's arguments that this command line settles by itself."""
+        settled = {"weights_only", "verbose", "return_predictions"}
+        return {name: skipped | settled for name, skipped in LightningCLI.subcommands().items()}
+
+    def _parse_ckpt_path(self) -> None:
+        """Overrides Lightning, which would let a checkpoint's hyper-parameters beat the given configuration."""
+
+    def fit(self, ckpt_path: str | None, **_: object) -> None:
+        """Train, then write the best averaged weights and their card into the run's folder."""
+        self._load(ckpt_path)
+        resumed = ckpt_path if ckpt_path and _is_checkpoint(ckpt_path) else None
+        self.trainer.fit(self.model, datamodule=self.datamodule, ckpt_path=resumed, weights_only=True)
+        if self._get(self.config, "trainer").fast_dev_run:
+            return
+        best = self.trainer.checkpoint_callback
+        if isinstance(best, ModelCheckpoint) and best.best_model_path:
+            self._load(best.best_model_path)
+        metrics = self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)[0]
+        card = {
+            "data": self.datamodule.describe(),
+            "metrics": {name: round(value, 4) for name, value in metrics.items()},
+            "seed": self._get(self.config, "seed_everything"),
+            "command": self.command,
+        }
+        path = self.model.save(self.trainer.log_dir or ".", card=card)
+        self._report({"weights": str(path), "metrics": card["metrics"]})
+
+    def validate(self, ckpt_path: str | None, **_: object) -> None:
+        """Metrics over the validation split."""
+        self._load(ckpt_path)
+        self._report(dict(self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)[0]))
+
+    def test(self, ckpt_path: str | None, **_: object) -> None:
+        """Metrics over the test split."""
+        self._load(ckpt_path)
+        self._report(dict(self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)[0]))
+
+    def predict(self, ckpt_path: str | None, **_: object) -> None:
+        """Probabilities of success of one split's grasps, in the order of the set, to predictions.json in the run."""
+        self._load(ckpt_path)
+        batches = self.trainer.predict(self.model, datamodule=self.datamodule) or []
+        path = Path(self.trainer.log_dir or ".") / "predictions.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        probabilities = torch.cat([torch.as_tensor(batch) for batch in batches]).tolist()
+        path.write_text(json.dumps({"split": self.datamodule.predict_split, "probability": probabilities}) + "\n")
+        self._report({"predictions": str(path)})
+
+    def _load(self, ckpt_path: str | None) -> None:
+        """Put the weights that --ckpt_path names into the model."""
+        if ckpt_path is not None:
+            weights = read_checkpoint(ckpt_path) if _is_checkpoint(ckpt_path) else load(ckpt_path).state_dict()
+            load_weights(self.model, weights, ckpt_path)
+
+    def _report(self, results: dict[str, Any]) -> None:
+        if self._get(self.config, "json"):
+            sys.stdout.write(json.dumps(results) + "\n")
+            return
+        for name, value in (results.pop("metrics", {}) | results).items():
+            sys.stdout.write(f"{name:30} {value:.4f}\n" if isinstance(value, float) else f"{name:30} {value}\n")
+
+
+def _is_checkpoint(path: str | Path) -> bool:
+    return Path(path).suffix == ".ckpt"
+
+
+def read_checkpoint(path: str | Path) -> dict[str, torch.Tensor]:
+    """The averaged weights of one of Lightning's checkpoints; only plain tensors are ever read.
+
+    Raises FileNotFoundError, or ValueError when the file is damaged or holds more than tensors and plain values.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"checkpoint {path} does not exist")
+    try:
+        weights: dict[str, torch.Tensor] = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
+    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise ValueError(f"checkpoint {path} is not what fit writes, refused: {reason[:99]}") from None
+    return weights
+
+
+def _with_configs(args: list[str]) -> list[str]:
+    """The arguments, with bare names of configurations looked up in configs/."""
+    out: list[str] = []
+    for arg in args:
+        name, equals, value = arg.partition("=")
+        if name in CONFIG_OPTIONS and equals:
+            out += [name, _config(value)]
+        elif out and out[-1] in CONFIG_OPTIONS:
+            out.append(_config(arg))
+        else:
+            out.append(arg)
+    return out
+
+
+def _config(name: str) -> str:
+    path = Path(name)
+    if path.is_file():
+        return name
+    shipped = resource("configs") / name
+    if path.name == name and shipped.is_file():
+        return str(shipped)
+    known = ", ".join(sorted(file.name for file in resource("configs").glob("*.yaml")))
+    raise FileNotFoundError(f"configuration {name} does not exist, here or among those shipped: {known}")
+
+
+def main(args: list[str]) -> None:
+    """Run `fit`, `validate`, `test` or `predict` with arguments as on the command line, the subcommand first.
+
+    Raises FileNotFoundError or ValueError, in one line, when the call is wrong; SystemExit(0) after --help.
+    """
+    asked = {arg.partition("=")[0] for arg in args}
+    if not asked & {"-h", "--help"}:
+        if not args or args[0] not in SUBCOMMANDS:
+            raise ValueError(f"give one of {', '.join(SUBCOMMANDS)}, got {args[0] if args else 'nothing'}")
+        if not asked & {*CONFIG_OPTIONS, "--model"}:
+            raise ValueError(f"{args[0]} needs a configuration that says what the model is; add --config em2.yaml")
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in NOT_NEWS:
+        warnings.filterwarnings("ignore", message)
+    try:
+        CommandLine(_with_configs(args), shlex.join(["python", "-m", "dexzoo", *args]))
+    except (ArgumentError, argparse.ArgumentError) as error:
+        raise ValueError(f"{args[0]}: {' '.join(str(error).split())[:400]}") from None
