@@ -19,21 +19,28 @@ class EM1(GraspEvaluator):
     softmax over {fail, success}. ReLU and dropout after every FC, Xavier weights.
 
     trunk: "hed" (shipped) or "imagenet" (fetched). dropout: probability of dropping a unit.
+    gain: of Xavier's weights; the root of 2 keeps the variance through ReLUs, which 1, the thesis', does not.
     The other arguments are `GraspEvaluator`'s.
     """
 
     architecture: ClassVar[str] = "em1"
     frozen_encoder: ClassVar[bool] = True
 
-    def __init__(self, trunk: str = "hed", dropout: float = 0.5, **training: Unpack[TrainingOptions]) -> None:
+    def __init__(
+        self,
+        trunk: str = "hed",
+        dropout: float = 0.5,
+        gain: float = 1.0,
+        **training: Unpack[TrainingOptions],
+    ) -> None:
         super().__init__(**training)
-        self.trunk, self.dropout = trunk, dropout
+        self.trunk, self.dropout, self.gain = trunk, dropout, gain
         self.image_encoder = DepthEncoder(trunk)
         self.grasp_vector = GraspVector()
         self.image_branch = nn.Sequential(*dense(512 * 7 * 7, 1024, dropout))
         self.hand_branch = nn.Sequential(*dense(280, 1024, dropout))
         self.head = nn.Sequential(*dense(1024, 1024, dropout, depth=4), nn.Linear(1024, 2))
-        initialise(self)
+        initialise(self, gain)
 
     def fit_statistics(self, images: Float[Tensor, "view 2 224 224"], waypoints: Float[Tensor, "grasp 10 28"]) -> None:
         """Set the standardisation of both inputs from training data."""

@@ -24,6 +24,7 @@ class EM2(GraspEvaluator):
 
     width: 2048 as the thesis' text has it; its Table 3.1 has 4096.
     trunk: "hed" (shipped) or "imagenet" (fetched). dropout: probability of dropping a unit.
+    gain: of Xavier's weights; the root of 2 keeps the variance through ReLUs, which 1, the thesis', does not.
     The other arguments are `GraspEvaluator`'s.
     """
 
@@ -31,10 +32,15 @@ class EM2(GraspEvaluator):
     frozen_encoder: ClassVar[bool] = True
 
     def __init__(
-        self, width: int = 2048, trunk: str = "hed", dropout: float = 0.5, **training: Unpack[TrainingOptions]
+        self,
+        width: int = 2048,
+        trunk: str = "hed",
+        dropout: float = 0.5,
+        gain: float = 1.0,
+        **training: Unpack[TrainingOptions],
     ) -> None:
         super().__init__(**training)
-        self.width, self.trunk, self.dropout = width, trunk, dropout
+        self.width, self.trunk, self.dropout, self.gain = width, trunk, dropout, gain
         self.image_encoder = DepthEncoder(trunk)
         self.grasp_vector = GraspVector()
         layers: list[nn.Module] = []
@@ -47,7 +53,7 @@ class EM2(GraspEvaluator):
                 channels = size
         self.hand_branch = nn.Sequential(*layers)
         self.head = nn.Sequential(*dense(1024, width, dropout, depth=2), nn.Linear(width, 2))
-        initialise(self)
+        initialise(self, gain)
 
     def fit_statistics(self, images: Float[Tensor, "view 2 224 224"], waypoints: Float[Tensor, "grasp 10 28"]) -> None:
         """Set the standardisation of both inputs from training data."""

@@ -131,11 +131,14 @@ class GraspVector(nn.Module):
         return (self.flatten(waypoints) - self.mean) / self.std
 
 
-def initialise(module: nn.Module) -> None:
-    """Xavier's uniform weights and zero biases in every linear layer and convolution (Glorot and Bengio 2010)."""
+def initialise(module: nn.Module, gain: float = 1.0) -> None:
+    """Xavier's uniform weights times `gain`, and zero biases, in linear layers and convolutions (Glorot, Bengio 2010).
+
+    A ReLU halves the variance: with gain 1 thirteen layers leave a hundredth of their input, with the root of 2 all.
+    """
     for layer in module.modules():
         if isinstance(layer, (nn.Linear, nn.Conv1d, nn.Conv2d)):
-            nn.init.xavier_uniform_(layer.weight)
+            nn.init.xavier_uniform_(layer.weight, gain)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
 

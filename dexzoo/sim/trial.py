@@ -21,6 +21,7 @@ APPROACH, CLOSE, SQUEEZE_TIME, PAUSE, LIFT, HOLD = 0.2, 0.9, 0.4, 0.1, 2.0, 2.0
 LIFT_HEIGHT = 1.0
 _CHUNK = 25  # steps between looks at who has lost the object
 _LOST = 0.1  # metres, besides the object's radius, that it may stay behind the hand
+_FALLING = 0.2  # m/s of the object at the end, when the hand stands still
 _BATCH = 256  # trials whose trajectories are in memory at once
 
 
@@ -199,6 +200,10 @@ def _run_batch(model: mujoco.MjModel, scene: Scene, grasps: Grasps, hand: Hand, 
         alive = alive[~away]
         if end == lifted:
             grip_pose[alive] = _relative(qpos[alive], wrist_at, object_at)
+    velocity_at = model.joint("object").dofadr[0]
+    falling = np.linalg.norm(batch.bind("qvel")[alive, velocity_at : velocity_at + 3], axis=1) > _FALLING
+    lost_at[alive[falling]] = LIFT + HOLD
+    alive = alive[~falling]
     success = np.zeros(count, bool)
     shift, turned = np.full(count, np.nan, np.float32), np.full(count, np.nan, np.float32)
     success[alive] = True

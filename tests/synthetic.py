@@ -1,0 +1,115 @@
+"""A small grasp set made without a simulator: balls and boxes, and a rule that a grasp closed enough holds."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+
+from dexzoo import rotation
+from dexzoo.camera import Observation
+from dexzoo.data.schema import AIMED_CAMERA, encode_path, encode_view, merge, write_scene
+from dexzoo.grasp import Grasps
+from dexzoo.hand import default_hand
+
+SPLIT_OF = ("train", "train", "train", "train", "validation", "test")
+CLOSED = 0.75
+"""A grasp holds when its joints end, on average, beyond this share of their ranges."""
+
+
+def camera_pose(centre: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """A camera that looks at a point from 0.4 to 0.75 m, 30 to 57 degrees above it, upright."""
+    elevation, azimuth = np.deg2rad(rng.uniform(30, 57)), rng.uniform(0, 2 * np.pi)
+    way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    x = np.cross(-way, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack((x, np.cross(-way, x), -way))
+    T[:3, 3] = centre + rng.uniform(0.4, 0.75) * way
+    return T
+
+
+def render(
+    shape: str, half: NDArray[np.float64], centre: NDArray[np.float64], T_world_camera: NDArray[np.float64]
+) -> Observation:
+    """The aimed view of a "ball" of radius half[0] or of a "box", by intersecting each pixel's ray."""
+    ray = AIMED_CAMERA.directions() @ T_world_camera[:3, :3].T
+    origin = T_world_camera[:3, 3] - centre
+    if shape == "ball":
+        a, b = (ray * ray).sum(-1), ray @ origin
+        root = b * b - a * (origin @ origin - half[0] ** 2)
+        depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
+    else:
+        with np.errstate(divide="ignore"):
+            near = np.minimum((-half - origin) / ray, (half - origin) / ray).max(-1)
+            far = np.maximum((-half - origin) / ray, (half - origin) / ray).min(-1)
+        depth = np.where(near < far, near, 0)
+    return Observation(depth, AIMED_CAMERA, T_world_camera, mask=depth > 0)
+
+
+def draw_grasps(centre: NDArray[np.float64], count: int, rng: np.random.Generator) -> tuple[Grasps, NDArray[np.bool_]]:
+    """Grasps in the world frame whose palm comes towards a point from above, and whether they hold."""
+    way = rng.normal(size=(count, 3))
+    way[:, 2] = np.abs(way[:, 2])
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    end = rng.uniform(0.04, 0.14, count)
+    x = -way
+    y = np.cross(x, rng.normal(size=(count, 3)))
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    turn = rotation.from_matrix(torch.tensor(np.stack((x, y, np.cross(x, y)), -1), dtype=torch.float32))
+    distance = np.stack((end + 0.1, end, end), 1)[..., None]
+    position = torch.tensor(centre + distance * way[:, None], dtype=torch.float32)
+    hand = default_hand()
+    low, high = hand.reduce(hand.lower), hand.reduce(hand.upper)
+    share = torch.tensor(np.sort(rng.uniform(0, 1, (count, 3, len(hand.freedoms))), axis=1), dtype=torch.float32)
+    joints = hand.expand(low + share * (high - low))
+    kind = torch.tensor(rng.integers(0, 10, count))
+    grasps = Grasps.from_keyframes(position, turn[:, None].expand(-1, 3, -1), joints, kind, "world")
+    return grasps, share[:, 2].mean(-1).numpy() > CLOSED
+
+
+def write(folder: Path, num_grasps: int = 40, num_views: int = 2, seed: int = 0) -> Path:
+    """Write a set of one scene for each entry of SPLIT_OF, each an object of its own; returns its folder."""
+    rng = np.random.default_rng(seed)
+    for scene, split in enumerate(SPLIT_OF):
+        shape = ("ball", "box")[scene % 2]
+        half = np.full(3, rng.uniform(0.03, 0.05)) if shape == "ball" else rng.uniform(0.02, 0.05, 3)
+        centre = np.array([0.0, 0.0, half[2]])
+        views = [encode_view(render(shape, half, centre, camera_pose(centre, rng))) for _ in range(num_views)]
+        grasps, success = draw_grasps(centre, num_grasps, rng)
+        columns = {
+            "scene": [scene] * num_grasps,
+            "view": rng.integers(num_views, size=num_grasps).tolist(),
+            "grasp_type": grasps.grasp_type.tolist(),
+            "source": ["generated"] * num_grasps,
+            "log_likelihood": rng.normal(size=num_grasps).tolist(),
+            "path": encode_path(grasps, default_hand()).tolist(),
+            "success": success.tolist(),
+            "collided": [False] * num_grasps,
+            "unstable": [False] * num_grasps,
+            "shift": [0.0] * num_grasps,
+            "rotation": [0.0] * num_grasps,
+        }
+        row = {
+            "scene": scene,
+            "object": f"{shape}_{scene}",
+            "category": shape,
+            "split": split,
+            "mass": 0.2,
+            "friction": 0.7,
+            "scale": 1.0,
+            "seed": seed,
+            "T_world_object": np.eye(4).reshape(-1).tolist(),
+        }
+        named = [{"scene": scene, "view": view, **columns} for view, columns in enumerate(views)]
+        write_scene(folder / "scenes", row, named, pa.table(columns))
+    merge(folder / "scenes", folder)
+    return folder
+
+
+if __name__ == "__main__":
+    write(Path(sys.argv[1]))
