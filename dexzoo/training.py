@@ -191,5 +191,12 @@ def main(args: list[str]) -> None:
         warnings.filterwarnings("ignore", message)
     try:
         CommandLine(_with_configs(args), shlex.join(["python", "-m", "dexzoo", *args]))
-    except (ArgumentError, argparse.ArgumentError) as error:
-        raise ValueError(f"{args[0]}: {' '.join(str(error).split())[:400]}") from None
+    except (ArgumentError, argparse.ArgumentError, ValueError) as error:
+        raise ValueError(f"{args[0]}: {_reason(error)}") from None
+
+
+def _reason(error: Exception) -> str:
+    """The one line that matters of an error; jsonargparse lists, each after a dash, why no type of several fits."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    reasons = [line.removeprefix("- ") for line in lines if line.startswith("- ") and "NoneType" not in line]
+    return (reasons[0] if reasons else " ".join(lines))[:400]

@@ -1,0 +1,153 @@
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+import torch
+
+from dexzoo.data.datamodule import GraspDataModule, GraspDataset
+from dexzoo.data.schema import SPLITS
+from dexzoo.grasp import Grasps
+from dexzoo.models.em2 import EM2
+from dexzoo.models.evaluator import GraspEvaluator, Scene
+
+
+class ImageEvaluator(GraspEvaluator):
+    """The smallest architecture whose encoder is trained."""
+
+    architecture = "image"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(2))
+
+    def encode(self, images: torch.Tensor) -> Scene:
+        return {"mean": images.mean((2, 3)) @ self.weight}
+
+    def logit(self, scene: Scene, grasps: torch.Tensor) -> torch.Tensor:
+        return scene["mean"][:, None] + grasps[..., 2].mean(-1)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthetic.write(tmp_path_factory.mktemp("grasps"))
+
+
+@pytest.fixture(scope="module")
+def data(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> GraspDataModule:
+    return GraspDataModule(str(folder), batch_size=16, cache=str(tmp_path_factory.mktemp("cache")))
+
+
+@pytest.fixture(scope="module")
+def em2(data: GraspDataModule) -> EM2:
+    model = EM2(width=16)
+    data.fit_statistics(model)
+    return model
+
+
+def test_batches_hold_each_grasp_once_in_its_own_view(data: GraspDataModule, em2: EM2) -> None:
+    source = data.source
+    rows = np.flatnonzero(source.grasp_split == SPLITS.index("test"))
+    batches = list(data.loader(data.dataset("test", em2)))
+    grasps = torch.cat([batch.grasps for batch in batches])
+    assert grasps.shape == (len(rows), 1, 10, 28)
+    assert torch.cat([batch.success for batch in batches]).tolist() == source.success[rows].tolist()
+    assert torch.cat([batch.scene_index for batch in batches]).tolist() == source.grasp_scene[rows].tolist()
+    for i in (0, 17, len(rows) - 1):
+        observation = source.observation(int(source.grasp_view[rows[i]]))
+        expected = Grasps(source.world_grasps.waypoints[rows[i], None], "world")
+        torch.testing.assert_close(
+            grasps[i], expected.to_frame("camera", observation.T_world_camera).waypoints, atol=1e-5, rtol=0
+        )
+        features = em2.encode(observation.image()[None])["features"][0]
+        batch, row = divmod(i, 16)
+        views = batches[batch].views
+        assert isinstance(views, dict)
+        # half precision, and bfloat16 sums that depend on the size of the batch
+        torch.testing.assert_close(views["features"][row].float(), features, atol=0.02, rtol=0.02)
+
+
+def test_training_is_balanced_and_repeatable(data: GraspDataModule, em2: EM2) -> None:
+    dataset = data.dataset("train", em2)
+    dataset.success[:] = (torch.arange(len(dataset)) % 10 == 0).float()
+    first, again = ([b.success for b in data.loader(dataset, balanced=True)] for _ in range(2))
+    assert torch.equal(torch.cat(first), torch.cat(again))
+    assert torch.cat(first).mean() == pytest.approx(0.5, abs=0.12)  # 160 draws, three standard deviations
+
+
+def test_views_are_encoded_once_ever(
+    data: GraspDataModule, folder: Path, em2: EM2, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    encode = em2.encode
+    monkeypatch.setattr(em2, "encode", lambda images: seen.append(len(images)) or encode(images))
+    fresh = GraspDataModule(str(folder), cache=str(data.cache))
+    first, second = (fresh.dataset("validation", em2).scene for _ in range(2))
+    assert seen.count(2) <= 1  # the two views of the split, unless an earlier test did it
+    assert seen.count(1) == 2  # the probe image, each time
+    assert first is not None
+    assert second is not None
+    assert torch.equal(first["features"], second["features"])
+    em2_other = EM2(width=16)  # the same trunk with other statistics
+    seen_other = fresh.dataset("validation", em2_other).scene
+    assert seen_other is not None
+    assert not torch.equal(first["features"], seen_other["features"])
+
+
+def test_a_damaged_cache_is_made_again(data: GraspDataModule, em2: EM2) -> None:
+    before = data.dataset("test", em2).scene
+    for path in data.cache.rglob("*.safetensors"):
+        path.write_bytes(path.read_bytes()[:100])
+    after = data.dataset("test", em2).scene
+    assert before is not None
+    assert after is not None
+    torch.testing.assert_close(before, after)
+
+
+def test_a_trained_encoder_gets_images(data: GraspDataModule) -> None:
+    batch = next(iter(data.loader(data.dataset("train", ImageEvaluator()))))
+    assert isinstance(batch.views, torch.Tensor)
+    assert batch.views.shape == (16, 2, 224, 224)
+    row = int(np.flatnonzero(data.source.grasp_split == 0)[5])
+    assert torch.equal(batch.views[5], data.source.observation(int(data.source.grasp_view[row])).image())
+
+
+def test_loading_keeps_up(data: GraspDataModule) -> None:
+    count = 20_000
+    scene = {"features": torch.zeros(100, 512, dtype=torch.float16)}
+    dataset = GraspDataset(
+        torch.zeros(count, 10, 28),
+        (torch.arange(count) % 2).float(),
+        torch.zeros(count, dtype=torch.long),
+        torch.arange(count) % 100,
+        scene,
+        data.source,
+    )
+    start = time.perf_counter()
+    assert sum(len(batch.success) for batch in data.loader(dataset, balanced=True)) == count
+    assert count / (time.perf_counter() - start) > 50_000  # measured at batches of 64: 700,000 a second on one thread
+
+
+def test_wrong_data_is_named(folder: Path, em2: EM2, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"grasp set nowhere has no scenes\.parquet"):
+        GraspDataModule("nowhere").dataset("train", em2)
+    with pytest.raises(ValueError, match="predict_split 'all' is unknown; use one of train, validation, test"):
+        GraspDataModule(predict_split="all")
+    with pytest.raises(ValueError, match="batch_size is 0"):
+        GraspDataModule(batch_size=0)
+    data = GraspDataModule(str(folder), cache=str(tmp_path))
+    data.source.grasp_split[:] = 0
+    with pytest.raises(ValueError, match="has no grasps in its test split"):
+        data.dataset("test", em2)
+    dataset = data.dataset("train", em2)
+    dataset.success[:] = 1
+    with pytest.raises(ValueError, match="needs both successes and failures"):
+        data.loader(dataset, balanced=True)
+
+
+def test_a_folder_is_also_looked_up_beside_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert GraspDataModule("robots/dlr2").folder.is_dir()
+    (tmp_path / "robots" / "dlr2").mkdir(parents=True)
+    assert GraspDataModule("robots/dlr2").folder == Path("robots/dlr2")

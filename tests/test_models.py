@@ -1,0 +1,485 @@
+import hashlib
+import itertools
+import json
+import pickle
+import sys
+from pathlib import Path
+
+import pytest
+import synthetic
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from safetensors.torch import load_file
+
+from dexzoo import training
+from dexzoo.camera import Observation
+from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.grasp import POSITION, QUATERNION, Grasps
+from dexzoo.models import encoders, evaluator, zoo
+from dexzoo.models.em1 import EM1
+from dexzoo.models.em2 import EM2
+from dexzoo.models.evaluator import GraspEvaluator
+from dexzoo.resources import resource
+
+SMOKE = [
+    "--config",
+    "smoke.yaml",
+    "--trainer.max_steps",
+    "3",
+    "--trainer.val_check_interval",
+    "1",
+    "--model.width",
+    "16",
+    "--json",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthetic.write(tmp_path_factory.mktemp("grasps"))
+
+
+@pytest.fixture(scope="module")
+def data(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> GraspDataModule:
+    return GraspDataModule(str(folder), cache=str(tmp_path_factory.mktemp("cache")))
+
+
+@pytest.fixture(scope="module", params=zoo.list_models())
+def model(request: pytest.FixtureRequest, data: GraspDataModule) -> GraspEvaluator:
+    torch.manual_seed(0)
+    made = zoo.model_class(request.param)()
+    data.fit_statistics(made)
+    return made.eval()
+
+
+@pytest.fixture(scope="module")
+def observation(data: GraspDataModule) -> Observation:
+    return data.source.observation(0)
+
+
+@pytest.fixture(scope="module")
+def grasps(data: GraspDataModule) -> Grasps:
+    return data.source.world_grasps[:12]
+
+
+# every model of the zoo
+
+
+def test_a_model_is_registered_under_its_own_name(model: GraspEvaluator) -> None:
+    assert zoo.model_class(model.architecture) is type(model)
+    assert set(model.arguments) >= {"optimizer", "learning_rate", "weight_decay", "average_decay"}
+    assert all(isinstance(value, (str, int, float, bool, list)) for value in model.arguments.values())
+
+
+def test_shapes(model: GraspEvaluator, data: GraspDataModule) -> None:
+    images = torch.stack([data.source.observation(view).image() for view in range(2)])
+    scene = model.encode(images)
+    assert all(len(value) == 2 for value in scene.values())
+    assert model.logit(scene, data.waypoints[:6].reshape(2, 3, 10, 28)).shape == (2, 3)
+
+
+def test_views_and_grasps_do_not_mix(model: GraspEvaluator, data: GraspDataModule) -> None:
+    scene = model.encode(torch.stack([data.source.observation(view).image() for view in (0, 3)]))
+    waypoints = data.waypoints[:6].reshape(2, 3, 10, 28)
+    whole = model.logit(scene, waypoints)
+    one = model.logit({name: value[1:] for name, value in scene.items()}, waypoints[1:, 2:])
+    torch.testing.assert_close(whole[1, 2], one[0, 0], atol=1e-4, rtol=1e-4)
+
+
+def test_logits_follow_every_part_of_a_grasp(model: GraspEvaluator, data: GraspDataModule) -> None:
+    scene = model.encode(data.source.observation(0).image()[None])
+    waypoints = data.waypoints[None, :3].clone().requires_grad_()
+    (slope,) = torch.autograd.grad(model.logit(scene, waypoints).sum(), waypoints)
+    for part in (POSITION, QUATERNION, slice(7, 27)):
+        assert (slope[..., part].abs().sum((-1, -2)) > 0).all()
+
+
+def test_slopes_agree_with_finite_differences(model: GraspEvaluator, data: GraspDataModule) -> None:
+    exact = zoo.model_class(model.architecture)(**model.arguments).double().eval()
+    exact.load_state_dict(model.state_dict())
+    scene = {name: value.double() for name, value in model.encode(data.source.observation(0).image()[None]).items()}
+    waypoints = data.waypoints[None, :2].double().requires_grad_()
+    (slope,) = torch.autograd.grad(exact.logit(scene, waypoints).sum(), waypoints)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        way = torch.randn(waypoints.shape, generator=generator, dtype=torch.float64)
+        way[..., 27] = 0  # the type is a choice, not a number
+        step = 1e-7 * way
+        with torch.no_grad():
+            rise = (exact.logit(scene, waypoints + step) - exact.logit(scene, waypoints - step)).sum() / 2e-7
+        assert float(rise) == pytest.approx(float((slope * way).sum()), rel=1e-3, abs=1e-7)
+
+
+def test_scores_are_probabilities_and_the_same_in_either_frame(
+    model: GraspEvaluator, observation: Observation, grasps: Grasps
+) -> None:
+    p = model.score(observation, grasps)
+    assert p.shape == (12,)
+    assert ((p > 0) & (p < 1)).all()
+    in_camera = grasps.to_frame("camera", observation.T_world_camera)
+    torch.testing.assert_close(model.score(observation, in_camera), p, atol=1e-4, rtol=0)
+    logits = model.prepare(observation).logit(grasps.waypoints)
+    torch.testing.assert_close(logits.sigmoid(), p, atol=1e-5, rtol=0)
+    assert model.score(observation, grasps[:0]).shape == (0,)
+
+
+def test_the_image_is_encoded_once(
+    model: GraspEvaluator, observation: Observation, grasps: Grasps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    encode = model.encode
+    whole = model.score(observation, grasps)
+    monkeypatch.setattr(model, "encode", lambda images: calls.append(tuple(images.shape)) or encode(images))
+    monkeypatch.setattr(evaluator, "CHUNK", 5)
+    torch.testing.assert_close(model.score(observation, grasps), whole, atol=1e-5, rtol=0)
+    assert calls == [(1, 2, 224, 224)]
+
+
+def test_scoring_drops_nothing_and_leaves_the_mode(
+    model: GraspEvaluator, observation: Observation, grasps: Grasps
+) -> None:
+    quiet = model.score(observation, grasps)
+    model.train()
+    torch.testing.assert_close(model.score(observation, grasps), quiet)
+    assert model.training
+    model.eval()
+
+
+def test_saving_and_loading_keep_the_scores(
+    model: GraspEvaluator, observation: Observation, grasps: Grasps, tmp_path: Path
+) -> None:
+    before = model.score(observation, grasps)
+    path = model.save(tmp_path, half=False, card={"seed": 3})
+    assert path.name == f"{model.architecture}.safetensors"
+    again = zoo.load(tmp_path)
+    assert type(again) is type(model)
+    assert not again.training
+    torch.testing.assert_close(again.score(observation, grasps), before, atol=1e-6, rtol=0)
+    model.save(tmp_path)
+    torch.testing.assert_close(zoo.load(path).score(observation, grasps), before, atol=5e-3, rtol=0)
+    card = json.loads(path.with_suffix(".json").read_text())
+    assert card["arguments"] == model.arguments
+    assert not any("trunk" in name for name in load_file(path))
+
+
+def test_a_half_turn_of_sign_in_a_quaternion_changes_nothing(model: GraspEvaluator, data: GraspDataModule) -> None:
+    scene = model.encode(data.source.observation(0).image()[None])
+    waypoints = data.waypoints[None, :4]
+    flipped = waypoints.clone()
+    flipped[..., QUATERNION] *= -1
+    torch.testing.assert_close(model.logit(scene, flipped), model.logit(scene, waypoints))
+
+
+def test_unknown_grasp_types_are_refused(model: GraspEvaluator, observation: Observation, grasps: Grasps) -> None:
+    waypoints = grasps.waypoints.clone()
+    waypoints[3, :, 27] = 10
+    with pytest.raises(ValueError, match="grasp type 10 is unknown, expected 0 to 9"):
+        model.score(observation, Grasps(waypoints, "world"))
+
+
+# the thesis' architectures
+
+
+def count(module: torch.nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def test_em1_has_the_thesis_sizes() -> None:
+    with torch.device("meta"):
+        image, hand = 512 * 7 * 7 * 1024 + 1024, 280 * 1024 + 1024
+        assert count(EM1()) == image + hand + 4 * (1024 * 1024 + 1024) + 2 * 1024 + 2 == 30_179_330
+
+
+@pytest.mark.parametrize(("width", "total"), [(2048, 11_206_978), (4096, 25_895_234)])
+def test_em2_has_the_thesis_sizes(width: int, total: int) -> None:
+    sizes = [1, 64, 64, 128, 128, 256, 256, 256, *[512] * 6]
+    hand = sum(3 * a * b + b for a, b in itertools.pairwise(sizes))
+    head = 1024 * width + width + width * width + width + 2 * width + 2
+    with torch.device("meta"):
+        assert count(EM2(width=width)) == hand + head == total
+
+
+def test_the_trunk_is_vgg16_frozen_and_converted_right() -> None:
+    trunk = encoders.load_trunk("hed")
+    assert count(trunk) == 14_714_688
+    assert not any(parameter.requires_grad for parameter in trunk.parameters())
+    # golden/vgg16_hed.py computes these from the source's own arrays; ours are stored in float16
+    golden = json.loads((Path(__file__).parent / "golden" / "vgg16_hed.json").read_text())
+    channel, row, column = torch.meshgrid(torch.arange(3), torch.arange(32), torch.arange(32), indexing="ij")
+    features = trunk[:-1](60 * torch.sin(0.3 * row + 0.7 * column + channel)[None])[0]
+    largest = float(features.max())
+    torch.testing.assert_close(
+        features[golden["channels"]], torch.tensor(golden["features"]), atol=2e-3 * largest, rtol=0
+    )
+    assert float(features.mean()) == pytest.approx(golden["mean"], rel=2e-3)
+
+
+def test_280_numbers_are_one_hot_type_then_ten_times_27(data: GraspDataModule) -> None:
+    waypoints = data.waypoints[:5]
+    vector = encoders.GraspVector.flatten(waypoints)
+    assert vector.shape == (5, 280)
+    assert torch.equal(vector[:, :10].argmax(1), waypoints[:, 0, 27].long())
+    assert torch.equal(vector[:, :10].sum(1), torch.ones(5))
+    torch.testing.assert_close(vector[:, 10:].reshape(5, 10, 27), waypoints[..., :27])
+
+
+def test_inputs_are_standardised_and_constant_ones_survive(data: GraspDataModule) -> None:
+    layer = encoders.GraspVector()
+    waypoints = data.waypoints.clone()
+    waypoints[..., 0] = 0.3
+    layer.fit_statistics(waypoints)
+    vector = layer(waypoints)
+    varied = vector.std(0) > 0.5
+    torch.testing.assert_close(vector.mean(0), torch.zeros(280), atol=1e-4, rtol=0)
+    torch.testing.assert_close(vector[:, varied].std(0), torch.ones(int(varied.sum())), atol=1e-3, rtol=0)
+    assert (vector[:, 10].abs() < 1e-5).all()
+
+
+def test_xavier(data: GraspDataModule) -> None:
+    layer = EM2(width=512).head[3]
+    assert isinstance(layer, torch.nn.Linear)
+    assert float(layer.weight.detach().var()) == pytest.approx(2 / (512 + 512), rel=0.02)
+    assert not layer.bias.detach().any()
+
+
+# the command line
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def arguments(data: GraspDataModule) -> list[str]:
+    return ["--data.folder", str(data.folder), "--data.cache", str(data.cache)]
+
+
+@pytest.mark.parametrize("config", sorted(path.name for path in resource("configs").glob("*.yaml")))
+@pytest.mark.usefixtures("here")
+def test_every_configuration_runs(config: str, arguments: list[str]) -> None:
+    training.main(["fit", "--config", config, *arguments, "--trainer.fast_dev_run", "1"])
+
+
+def test_fit_writes_a_run_that_load_and_the_other_commands_take(
+    here: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    training.main(["fit", *SMOKE, *arguments, "--seed", "5"])
+    result = json.loads(capsys.readouterr().out)
+    weights = Path(result["weights"])
+    assert weights == Path("runs/smoke/version_0/em2.safetensors")
+    card = json.loads(weights.with_suffix(".json").read_text())
+    assert card["seed"] == 5
+    assert card["arguments"]["width"] == 16
+    assert card["command"].startswith("python -m dexzoo fit --config smoke.yaml")
+    assert card["data"]["train_grasps"] == 160
+    assert card["metrics"].keys() >= {"validation_auroc", "validation_top1", "validation_loss"}
+    assert isinstance(zoo.load(weights.parent), EM2)
+    assert (weights.parent / "metrics.csv").is_file()
+
+    # what is exported is the average that validation saw best, not the last raw weights
+    checkpoint = torch.load(weights.parent / "checkpoints" / "best.ckpt", weights_only=True)
+    exported = load_file(weights)["head.0.weight"]
+    assert torch.equal(exported, checkpoint["state_dict"]["head.0.weight"].half())
+    assert not torch.equal(exported, checkpoint["current_model_state"]["head.0.weight"].half())
+
+    figures = []
+    for path in (weights.parent / "checkpoints" / "best.ckpt", weights.parent):
+        training.main(["test", *SMOKE, *arguments, "--ckpt_path", str(path)])
+        figures.append(json.loads(capsys.readouterr().out)["test_loss"])
+    assert figures[0] == pytest.approx(figures[1], abs=1e-2)
+    training.main(["predict", *SMOKE, *arguments, "--ckpt_path", str(weights)])
+    predicted = json.loads(Path(json.loads(capsys.readouterr().out)["predictions"]).read_text())
+    assert len(predicted["probability"]) == 40
+
+    # resuming goes on from the step it stopped at
+    resume = ["fit", *SMOKE, *arguments, "--ckpt_path", str(weights.parent / "checkpoints" / "best.ckpt")]
+    training.main([*resume, "--trainer.max_steps", "5"])
+    assert Path(json.loads(capsys.readouterr().out)["weights"]).is_file()
+
+
+@pytest.mark.usefixtures("here")
+def test_the_configuration_beats_what_a_checkpoint_stores(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training.main(["fit", *SMOKE, *arguments, "--model.learning_rate", "0.01"])
+    path = Path("runs/smoke/version_0/checkpoints/best.ckpt")
+    checkpoint = torch.load(path, weights_only=True)
+    assert "hyper_parameters" not in checkpoint
+    checkpoint["hyper_parameters"] = {"learning_rate": 0.01, "_class_path": "dexzoo.models.em2.EM2"}
+    torch.save(checkpoint, path)
+    seen: list[float] = []
+    monkeypatch.setattr(Trainer, "test", lambda self, model, **_: seen.append(model.learning_rate) or [{}])
+    training.main(["test", *SMOKE, *arguments, "--model.learning_rate", "0.5", "--ckpt_path", str(path)])
+    assert seen == [0.5]
+
+
+class Recorder(Callback):
+    """The weights after each step, and those that validation sees."""
+
+    def __init__(self) -> None:
+        self.raw: list[torch.Tensor] = []
+        self.validated: list[torch.Tensor] = []
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
+        self.raw.append(pl_module.head[0].weight.detach().clone())
+
+    def on_validation_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: object) -> None:
+        self.validated.append(pl_module.head[0].weight.detach().clone())
+
+
+def test_validation_sees_the_moving_average(data: GraspDataModule) -> None:
+    torch.manual_seed(0)
+    model = EM2(width=8, optimizer="adamw", average_decay=0.3)
+    recorder = Recorder()
+    trainer = Trainer(
+        accelerator="cpu", max_steps=4, val_check_interval=4, check_val_every_n_epoch=None, limit_val_batches=1, num_sanity_val_steps=0, logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False, callbacks=[recorder],
+    )  # fmt: skip
+    trainer.fit(model, datamodule=data)
+    average = recorder.raw[0]
+    for step, weight in enumerate(recorder.raw[1:], start=1):
+        decay = min(0.3, (1 + step) / (10 + step))
+        average = decay * average + (1 - decay) * weight
+    torch.testing.assert_close(recorder.validated[0], average)
+    torch.testing.assert_close(model.head[0].weight.detach(), average)
+    trainer.validate(model, datamodule=data, verbose=False)
+    torch.testing.assert_close(recorder.validated[-1], average)
+
+
+@pytest.mark.usefixtures("here")
+def test_calls_that_are_wrong_get_one_line(arguments: list[str], tmp_path: Path) -> None:
+    wrong: list[tuple[list[str], str]] = [
+        ([], "give one of fit, validate, test, predict, got nothing"),
+        (["train"], "got train"),
+        (["test", "--ckpt_path", "x.ckpt"], "test needs a configuration .*add --config em2.yaml"),
+        (["fit", "--config", "em9.yaml"], "configuration em9.yaml does not exist.*em2.yaml"),
+        (["fit", "--config", "smoke.yaml", "--model.wdth", "3"], "'wdth' is not accepted"),
+        (["fit", "--config=smoke.yaml", "--model.optimizer", "adam"], "optimizer 'adam' is unknown"),
+        (["fit", "--config", "smoke.yaml", "--data.folder", "nowhere"], "grasp set nowhere has no scenes.parquet"),
+        (["test", *SMOKE, *arguments, "--ckpt_path", "x.ckpt"], "checkpoint x.ckpt does not exist"),
+    ]
+    bad = tmp_path / "bad.ckpt"
+    bad.write_bytes(pickle.dumps(Path("harmless")))
+    wrong.append((["test", *SMOKE, *arguments, "--ckpt_path", str(bad)], "is not what fit writes, refused"))
+    EM2(width=8).save(tmp_path / "narrow.safetensors")
+    other = ["test", *SMOKE, *arguments, "--ckpt_path", str(tmp_path / "narrow.safetensors")]
+    wrong.append((other, "holds another architecture than em2 as configured"))
+    for args, message in wrong:
+        with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
+            training.main(args)
+        assert "\n" not in str(caught.value)
+
+
+def test_help_ends_well(capsys: pytest.CaptureFixture[str]) -> None:
+    for args in (["fit", "--help"], ["--help"]):
+        with pytest.raises(SystemExit) as caught:
+            training.main(args)
+        assert caught.value.code == 0
+    assert "predict" in capsys.readouterr().out
+
+
+# files
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return EM2(width=8).save(tmp_path_factory.mktemp("saved"))
+
+
+def copy(saved: Path, folder: Path) -> Path:
+    for suffix in (".safetensors", ".json"):
+        (folder / "em2").with_suffix(suffix).write_bytes(saved.with_suffix(suffix).read_bytes())
+    return folder / "em2.safetensors"
+
+
+def change_card(path: Path, **values: object) -> None:
+    card = json.loads(path.with_suffix(".json").read_text())
+    path.with_suffix(".json").write_text(json.dumps(card | values))
+
+
+def test_damaged_weights_are_refused_in_one_line(saved: Path, tmp_path: Path) -> None:
+    path = copy(saved, tmp_path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"em2\.safetensors is truncated or not a safetensors file"):
+        zoo.load(path)
+    content = bytearray(saved.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="does not match the sha256 in its card"):
+        zoo.load(path)
+    copy(saved, tmp_path)
+    change_card(path, architecture="em1", arguments={})
+    with pytest.raises(ValueError, match="holds another architecture than em1"):
+        zoo.load(path)
+    change_card(path, architecture="em7")
+    with pytest.raises(ValueError, match="model 'em7' is unknown, did you mean em"):
+        zoo.load(path)
+    change_card(path, architecture="em2", arguments={"depth": 3})
+    with pytest.raises(ValueError, match=r"EM2 refuses its arguments: .*depth"):
+        zoo.load(path)
+    change_card(path, format="other")
+    with pytest.raises(ValueError, match="is not of an evaluator"):
+        zoo.load(path)
+    path.with_suffix(".json").write_text("{")
+    with pytest.raises(ValueError, match="is not JSON"):
+        zoo.load(path)
+    path.with_suffix(".json").unlink()
+    with pytest.raises(FileNotFoundError, match=r"has no card em2\.json beside it"):
+        zoo.load(path)
+
+
+@pytest.mark.parametrize("name", ["weights.ckpt", "weights.pt", "weights.safetensors"])
+def test_a_pickle_is_refused_unread(name: str, tmp_path: Path) -> None:
+    class Trap:
+        def __reduce__(self) -> tuple[object, ...]:
+            return (Path.touch, (tmp_path / "sprung",))
+
+    (tmp_path / name).write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(ValueError, match="is a pickle, which could run code, and was not read"):
+        zoo.load(tmp_path / name)
+    torch.save({"weight": torch.zeros(1)}, tmp_path / name)
+    with pytest.raises(ValueError, match="is a pickle"):
+        zoo.load(tmp_path / name)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_names_and_places_that_do_not_exist(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="model 'em22' is unknown, did you mean em2"):
+        zoo.load("em22")
+    with pytest.raises(ValueError, match="model 'zzz' is unknown; known are em1, em2"):
+        zoo.load("zzz")
+    with pytest.raises(FileNotFoundError, match=r"weights .*none\.safetensors do not exist"):
+        zoo.load(tmp_path / "none.safetensors")
+    with pytest.raises(FileNotFoundError, match=r"must hold one \.safetensors file of weights, found none"):
+        zoo.load(tmp_path)
+    with pytest.raises(ValueError, match="must be hf://ORGANISATION/REPOSITORY"):
+        zoo.load("hf://em2")
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(ValueError, match=r"needs huggingface_hub; install it with `pip install dexzoo\[hub\]`"):
+        zoo.load("hf://someone/em2")
+    monkeypatch.setattr(zoo, "resource", lambda name: tmp_path)
+    with pytest.raises(
+        FileNotFoundError, match=r"model em1 comes without weights; train them with .*--config em1\.yaml"
+    ):
+        zoo.load("em1")
+
+
+def test_a_hub_repository_is_a_folder(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hub = pytest.importorskip("huggingface_hub")
+    asked = []
+    monkeypatch.setattr(hub, "snapshot_download", lambda name, **_: asked.append(name) or str(saved.parent))
+    assert isinstance(zoo.load("hf://someone/em2"), EM2)
+    assert asked == ["someone/em2"]
+
+
+def test_a_stranger_trunk_is_named() -> None:
+    with pytest.raises(ValueError, match="trunk 'resnet' is unknown; use one of hed, imagenet"):
+        EM2(trunk="resnet")
+
+
+def test_the_shipped_trunk_is_what_its_card_says() -> None:
+    path = resource("checkpoints") / "vgg16_hed.safetensors"
+    card = json.loads(path.with_suffix(".json").read_text())
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == card["sha256"]

@@ -67,7 +67,7 @@ def collect_scene(folder: Path, seed: int, index: int) -> str:
     try:
         generated = HeuristicGenerator().generate(observations[0], NUM_GENERATED, int(rng.integers(2**31)))
         grasps = generated.to_frame("world", observations[0].T_world_camera)
-    except ValueError:  # no feasible grasp from this view: a scene of no rows
+    except RuntimeError:  # no feasible grasp from this view: a scene of no rows
         grasps = Grasps(torch.zeros(0, 10, 28), "world", torch.zeros(0))
     outcomes = trial.run(scene, grasps, hand, num_threads=1)
     source = ["generated"] * len(grasps)

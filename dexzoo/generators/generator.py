@@ -15,5 +15,5 @@ class GraspGenerator(ABC):
     def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
         """At most `num_grasps` grasps in the camera frame, best first; the same for the same seed.
 
-        Raises ValueError when no object is seen or no feasible grasp is found.
+        Raises ValueError when too little of the object is seen, RuntimeError when no feasible grasp is found.
         """

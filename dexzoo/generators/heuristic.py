@@ -64,13 +64,16 @@ class HeuristicGenerator(GraspGenerator):
         self.hand: Hand = default_hand()
 
     def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
-        """Up to `num_grasps` grasps in the camera frame, those with the best opposition first."""
+        """Up to `num_grasps` grasps in the camera frame, those with the best opposition first.
+
+        Raises ValueError when too little of the object is seen, RuntimeError when no candidate is feasible.
+        """
         rng = np.random.default_rng(seed)
         cloud, normals = complete(observation, rng)
         position, quaternion, shape = self._sample(cloud, normals, rng)
         grasps, score = self._close(cloud, normals, position, quaternion, shape)
         if not len(grasps):
-            raise ValueError("no feasible grasp is found: the object may be too large, too flat or out of reach")
+            raise RuntimeError("no feasible grasp is found: the object may be too large, too flat or out of reach")
         order = spread(grasps, score, num_grasps)
         ranked = Grasps(grasps.waypoints[order], "world", score[order])
         return ranked.to_frame("camera", observation.T_world_camera)

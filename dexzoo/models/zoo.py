@@ -141,7 +141,7 @@ def load_weights(evaluator: GraspEvaluator, weights: dict[str, torch.Tensor], pa
     ]
     if odd:
         raise ValueError(
-            f"{path} holds another architecture than {evaluator.architecture} as configured: {len(odd)} tensors differ, "
-            f"the first is {odd[0]}; use the configuration that it was trained with"
+            f"{path} holds another architecture than {evaluator.architecture} as configured, by {len(odd)} tensors "
+            f"such as {odd[0]}; use the configuration that it was trained with"
         )
     evaluator.load_state_dict({name: value.to(own[name].dtype) for name, value in weights.items()})

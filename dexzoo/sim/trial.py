@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -11,7 +12,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from dexzoo import rotation
-from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE, Grasps
+from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE, Grasps, pose_matrix
 from dexzoo.hand import Hand
 from dexzoo.sim.scene import TIMESTEP, Scene
 
@@ -34,6 +35,7 @@ class Outcomes:
     unstable: the solver diverged; not counted as success.
     shift, rotation: how far the object moved in the hand between the end of the squeeze and the end of the hold, in
     metres and radians; NaN where it was lost. lost_at: seconds after the start of the lift; NaN where it was not.
+    success_rate: share of the trials that held; that of one trial is success.
     """
 
     success: NDArray[np.bool_]
@@ -42,6 +44,7 @@ class Outcomes:
     shift: NDArray[np.float32]
     rotation: NDArray[np.float32]
     lost_at: NDArray[np.float32]
+    success_rate: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.success)
@@ -122,6 +125,7 @@ def _scatter(done: Outcomes, index: NDArray[np.int64], collided: NDArray[np.bool
         numbers(done.shift),
         numbers(done.rotation),
         numbers(done.lost_at),
+        flags(done.success).astype(np.float32),
     )
 
 
@@ -150,85 +154,116 @@ def _interpolate(
     return wrist, turn, angles
 
 
+class _Execution:
+    """Many grasps under way on copies of one scene; poses are read from the state of the batch."""
+
+    def __init__(self, scene: Scene, grasps: Grasps, hand: Hand, model: mujoco.MjModel, num_threads: int) -> None:
+        self.wrist, self.turn, self.angles = trajectory(grasps, hand)
+        self.num_steps = self.wrist.shape[1]
+        self.batch = Batch(model, max(len(grasps), 1), num_threads)
+        self.qpos = self.batch.bind("qpos")
+        self.qvel = self.batch.bind("qvel")
+        self.wrist_at, self.object_at = model.joint("wrist").qposadr[0], model.joint("object").qposadr[0]
+        self.object_dof = model.joint("object").dofadr[0]
+        self.finger_at = [model.joint(name).qposadr[0] for name in hand.joint_names]
+        self.order = [hand.joint_names.index(model.actuator(i).name) for i in range(model.nu)]
+        self.center = scene.object.inertia[0]
+        at = self.object_at
+        self.qpos[:, at : at + 3] = scene.T_world_object[:3, 3]
+        mujoco.mju_mat2Quat(quaternion := np.zeros(4), scene.T_world_object[:3, :3].ravel())
+        self.qpos[:, at + 3 : at + 7] = quaternion
+        position, turn, joints = (part[:, 0].numpy() for part in _path(grasps))
+        at = self.wrist_at
+        self.qpos[: len(grasps), at : at + 7] = np.concatenate((position, turn), axis=1)
+        self.qpos[: len(grasps), self.finger_at] = joints
+
+    def advance(self, ids: NDArray[np.int64], begin: int, end: int) -> None:
+        """Follow the trajectory from step `begin` to `end`."""
+        parts = (self.angles[ids, begin:end][..., self.order], self.wrist[ids, begin:end], self.turn[ids, begin:end])
+        state = mujoco.mjtState
+        spec = state.mjSTATE_CTRL | state.mjSTATE_MOCAP_POS | state.mjSTATE_MOCAP_QUAT
+        self.batch.rollout(end - begin, np.concatenate(parts, axis=-1), int(spec), record=(), ids=ids)
+
+    def broken(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whose solver has warned or diverged."""
+        warned = self.batch.warning[ids, :, 1].sum(-1) > 0
+        return np.asarray(warned | ~np.isfinite(self.qpos[ids]).all(-1))
+
+    def object_center(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(n, 3) centres of mass of the object."""
+        pose = self.qpos[ids, self.object_at : self.object_at + 7]
+        return np.asarray(pose[:, :3] + rotation.rotate(torch.tensor(pose[:, 3:]), torch.tensor(self.center)).numpy())
+
+    def in_palm(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(n, 7) poses of the object in the palm frame."""
+        wrist = torch.tensor(self.qpos[ids, self.wrist_at : self.wrist_at + 7])
+        pose = torch.tensor(self.qpos[ids, self.object_at : self.object_at + 7])
+        inverse = rotation.conjugate(wrist[:, 3:])
+        offset = rotation.rotate(inverse, pose[:, :3] - wrist[:, :3])
+        return torch.cat((offset, rotation.normalize(rotation.multiply(inverse, pose[:, 3:]))), -1).numpy()
+
+
 def _run_batch(model: mujoco.MjModel, scene: Scene, grasps: Grasps, hand: Hand, num_threads: int) -> Outcomes:
     count = len(grasps)
-    wrist, turn, angles = trajectory(grasps, hand)
-    batch = Batch(model, max(count, 1), num_threads)
-    start = initial_state(model, scene, hand)
-    qpos = batch.bind("qpos")
-    qpos[:] = start
-    wrist_at = model.joint("wrist").qposadr[0]
-    finger_at = [model.joint(name).qposadr[0] for name in hand.joint_names]
-    first = _path(grasps)
-    qpos[:count, wrist_at : wrist_at + 3] = first[0][:, 0].numpy()
-    qpos[:count, wrist_at + 3 : wrist_at + 7] = first[1][:, 0].numpy()
-    qpos[:count, finger_at] = first[2][:, 0].numpy()
-
-    order = [hand.joint_names.index(model.actuator(i).name) for i in range(model.nu)]
-    spec = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
-    object_at = model.joint("object").qposadr[0]
-    center = scene.object.inertia[0]
+    run = _Execution(scene, grasps, hand, model, num_threads)
     limit = _LOST + scene.object.radius
-
-    def object_center(ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        return qpos[ids, object_at : object_at + 3] + _turn(qpos[ids, object_at + 3 : object_at + 7], center)
-
     alive = np.arange(count)
     unstable = np.zeros(count, bool)
     lost_at = np.full(count, np.nan, np.float32)
-    grip_pose = np.full((count, 7), np.nan)
+    gripped = np.full((count, 7), np.nan)
+    rest_height = run.object_center(np.zeros(1, np.int64))[0, 2]
     lifted = lift_start()
-    rest_height = float(object_center(np.zeros(1, np.int64))[0, 2]) if count else 0.0
-    steps = wrist.shape[1]
-    stops = sorted({*range(0, steps, _CHUNK), lifted, steps})
+    stops = sorted({*range(0, run.num_steps, _CHUNK), lifted, run.num_steps})
     for begin, end in zip(stops[:-1], stops[1:], strict=True):
         if not len(alive):
             break
-        control = np.concatenate(
-            (angles[alive, begin:end][..., order], wrist[alive, begin:end], turn[alive, begin:end]), axis=-1
-        )
-        batch.rollout(end - begin, control, int(spec), record=(), ids=alive)
-        broken = (batch.warning[alive, :, 1].sum(-1) > 0) | ~np.isfinite(qpos[alive]).all(-1)
+        run.advance(alive, begin, end)
+        broken = run.broken(alive)
         unstable[alive[broken]] = True
         alive = alive[~broken]
-        height = object_center(alive)
-        away = np.linalg.norm(height[:, :2] - wrist[alive, end - 1, :2], axis=1) > limit + 0.3
+        center = run.object_center(alive)
+        away = np.linalg.norm(center[:, :2] - run.wrist[alive, end - 1, :2], axis=1) > limit + 0.3
         if end >= lifted:
-            rise = wrist[alive, end - 1, 2] - wrist[alive, lifted - 1, 2]
-            away |= rise - (height[:, 2] - rest_height) > limit
+            rise = run.wrist[alive, end - 1, 2] - run.wrist[alive, lifted - 1, 2]
+            away |= rise - (center[:, 2] - rest_height) > limit
         lost_at[alive[away]] = (end - lifted) * TIMESTEP
         alive = alive[~away]
         if end == lifted:
-            grip_pose[alive] = _relative(qpos[alive], wrist_at, object_at)
-    velocity_at = model.joint("object").dofadr[0]
-    falling = np.linalg.norm(batch.bind("qvel")[alive, velocity_at : velocity_at + 3], axis=1) > _FALLING
-    lost_at[alive[falling]] = LIFT + HOLD
-    alive = alive[~falling]
+            gripped[alive] = run.in_palm(alive)
+    speed = np.linalg.norm(run.qvel[alive, run.object_dof : run.object_dof + 3], axis=1)
+    lost_at[alive[speed > _FALLING]] = LIFT + HOLD
+    alive = alive[speed <= _FALLING]
     success = np.zeros(count, bool)
     shift, turned = np.full(count, np.nan, np.float32), np.full(count, np.nan, np.float32)
     success[alive] = True
-    now = _relative(qpos[alive], wrist_at, object_at)
-    shift[alive] = np.linalg.norm(now[:, :3] - grip_pose[alive, :3], axis=1)
-    turned[alive] = rotation.angle(torch.tensor(now[:, 3:]), torch.tensor(grip_pose[alive, 3:])).numpy()
-    return Outcomes(success, np.zeros(count, bool), unstable, shift, turned, lost_at)
+    now = run.in_palm(alive)
+    shift[alive] = np.linalg.norm(now[:, :3] - gripped[alive, :3], axis=1)
+    turned[alive] = rotation.angle(torch.tensor(now[:, 3:]), torch.tensor(gripped[alive, 3:])).numpy()
+    return Outcomes(success, np.zeros(count, bool), unstable, shift, turned, lost_at, success.astype(np.float32))
 
 
-def initial_state(model: mujoco.MjModel, scene: Scene, hand: Hand) -> NDArray[np.float64]:
-    """qpos with the object at rest in the scene."""
-    qpos = model.qpos0.copy()
-    at = model.joint("object").qposadr[0]
-    qpos[at : at + 3] = scene.T_world_object[:3, 3]
-    mujoco.mju_mat2Quat(qpos[at + 3 : at + 7], scene.T_world_object[:3, :3].ravel())
-    return qpos
+class Moment(NamedTuple):
+    """What a picture of a trial needs: the hand as a waypoint (28,), and T_world_object."""
+
+    waypoint: torch.Tensor
+    T_world_object: NDArray[np.float64]
 
 
-def _turn(quaternion: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(rotation.rotate(torch.tensor(quaternion), torch.tensor(vector)).numpy())
+def replay(scene: Scene, grasp: Grasps, hand: Hand, seconds: list[float]) -> list[Moment]:
+    """Execute one grasp, in the world frame, again and tell where all stood at the given times, ascending.
 
-
-def _relative(qpos: NDArray[np.float64], wrist_at: int, object_at: int) -> NDArray[np.float64]:
-    """(n, 7) pose of the object in the palm frame."""
-    inverse = rotation.conjugate(torch.tensor(qpos[:, wrist_at + 3 : wrist_at + 7]))
-    offset = torch.tensor(qpos[:, object_at : object_at + 3] - qpos[:, wrist_at : wrist_at + 3])
-    turn = rotation.multiply(inverse, torch.tensor(qpos[:, object_at + 3 : object_at + 7]))
-    return torch.cat((rotation.rotate(inverse, offset), rotation.normalize(turn)), -1).numpy()
+    Times count from the start of the lift; negative ones lie before it.
+    """
+    run = _Execution(scene, grasp, hand, scene.model(hand.spec), 1)
+    only = np.zeros(1, np.int64)
+    moments, begin = [], 0
+    for time in seconds:
+        end = min(max(lift_start() + round(time / TIMESTEP), begin + 1), run.num_steps)
+        run.advance(only, begin, end)
+        begin = end
+        state = torch.tensor(run.qpos[0])
+        wrist = state[run.wrist_at : run.wrist_at + 7]
+        waypoint = torch.cat((wrist, state[run.finger_at], grasp.waypoints[0, 0, 27:].double()))
+        pose = state[run.object_at : run.object_at + 7]
+        moments.append(Moment(waypoint, pose_matrix(pose[:3], pose[3:]).numpy()))
+    return moments

@@ -1,0 +1,282 @@
+"""The command line: python -m dexzoo COMMAND. Exit status 0 done, 1 the work failed, 2 the call was wrong."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jsonargparse import ArgumentParser, Namespace
+from rich.console import Console
+from rich.table import Table
+
+from dexzoo import plots, training
+from dexzoo.camera import Observation
+from dexzoo.data.collect import collect
+from dexzoo.data.schema import merge
+from dexzoo.grasp import GRASP_TYPES, GRIP, PREGRASP, SQUEEZE, Grasps
+from dexzoo.hand import default_hand
+from dexzoo.models.zoo import list_models, load, shipped
+from dexzoo.planning import Plan, plan
+from dexzoo.refinement import refine
+from dexzoo.sim import ObjectModel, Scene
+from dexzoo.sim.shapes import make_object, object_names
+from dexzoo.verification import verify
+
+TRAINING = ("fit", "validate", "test", "predict")
+OK, FAILED, WRONG_CALL = 0, 1, 2
+Result = tuple[dict[str, Any], Table | None]
+
+_out = Console()
+_err = Console(stderr=True)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status."""
+    args = list(sys.argv[1:] if args is None else args)
+    try:
+        if args and args[0] in TRAINING:
+            training.main(args)
+            return OK
+        parser = _parser()
+        config = parser.parse_args(args or ["--help"])
+        options: Namespace = config[config.subcommand]
+        result, table = _COMMANDS[config.subcommand](options)
+        if options.json:
+            sys.stdout.write(json.dumps(result, indent=2) + "\n")
+        elif table is not None:
+            _out.print(table)
+    except (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
+        return _complain(error, WRONG_CALL)
+    except (RuntimeError, OSError) as error:
+        return _complain(error, FAILED)
+    except KeyboardInterrupt:
+        return _complain("stopped", FAILED)
+    return OK
+
+
+def _complain(error: Exception | str, status: int) -> int:
+    message = " ".join(str(error).split())
+    sys.stderr.write(f"dexzoo: {message}\n")
+    return status
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(
+        prog="python -m dexzoo",
+        description="Grasps for a five-finger hand from one depth image. "
+        f"Training: {', '.join(TRAINING)} (each with --config FILE and --help of its own).",
+    )
+    commands = parser.add_subcommands(dest="subcommand", required=True)
+
+    def add(name: str, text: str) -> ArgumentParser:
+        command = ArgumentParser(description=text)
+        command.add_argument("--seed", type=int, default=0, help="the same seed gives the same result")
+        command.add_argument("--json", action="store_true", help="print JSON for machines")
+        commands.add_subcommand(name, command, help=text)
+        return command
+
+    def add_observation(command: ArgumentParser) -> None:
+        command.add_argument("--depth", type=Path, required=True, help="16-bit PNG, or .npy in metres")
+        command.add_argument(
+            "--camera", type=Path, required=True, help="JSON: width, height, fx, fy, cx, cy, depth_scale, table_plane"
+        )
+        command.add_argument("--evaluator", default="em2", help="name, file, folder or hf:// address of the model")
+
+    command = add("plan", "Propose and rank grasps for one depth image.")
+    add_observation(command)
+    command.add_argument("--num_grasps", type=int, default=100, help="candidates to generate")
+    command.add_argument("--refine", action="store_true", help="refine the twenty best")
+    command.add_argument("--out", type=Path, help="folder for grasps.safetensors, plan.json and pictures")
+
+    command = add("refine", "Improve grasps by gradient on one depth image.")
+    add_observation(command)
+    command.add_argument("--grasps", type=Path, required=True, help="file of grasps, from plan --out")
+    command.add_argument("--variables", default="grip", choices=["grip", "waypoints", "last3"], help="what is moved")
+    command.add_argument("--num_steps", type=int, default=20, help="steps of the ascent")
+    command.add_argument("--out", type=Path, help="file for the refined grasps (.safetensors)")
+
+    command = add("verify", "Execute grasps on an object in simulation: close, lift 1 m, hold 2 s.")
+    command.add_argument("--object", required=True, help="mesh file in metres, z up; or a name such as mug_03")
+    command.add_argument("--hulls", type=Path, nargs="*", help="files of its convex parts; otherwise computed")
+    command.add_argument("--mass", type=float, help="kg (default 0.2, or the named object's)")
+    command.add_argument("--friction", type=float, help="sliding friction (default 0.7, or the named object's)")
+    command.add_argument("--grasps", type=Path, help="file of grasps in the world frame; otherwise they are generated")
+    command.add_argument("--num_grasps", type=int, default=50, help="candidates to generate from one view")
+    command.add_argument("--evaluator", default="em2", help="name or path of the model that ranks them")
+    command.add_argument("--trials", type=int, default=1, help="repetitions under drawn mass, friction and wrist error")
+
+    command = add("collect", "Make a grasp set: scenes, views, grasps and their outcomes. Goes on where it stopped.")
+    command.add_argument("--out", type=Path, required=True, help="folder of the grasp set")
+    command.add_argument("--scenes", type=int, default=100, help="how many scenes")
+    command.add_argument("--workers", type=int, default=1, help="processes")
+
+    add("models", "List the evaluative models.")
+    return parser
+
+
+def _plan(options: Namespace) -> Result:
+    if options.num_grasps < 1:
+        raise ValueError(f"--num_grasps is {options.num_grasps}, expected at least 1")
+    observation = Observation.load(options.depth, options.camera)
+    with _err.status("generating, scoring and refining grasps" if options.refine else "generating and scoring grasps"):
+        result = plan(observation, options.evaluator, options.num_grasps, 20 if options.refine else 0, options.seed)
+    rows = _plan_rows(result)
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        result.grasps.save(options.out / "grasps.safetensors")
+        summary = {"frame": "camera", "T_world_camera": observation.T_world_camera.tolist(), "grasps": rows}
+        (options.out / "plan.json").write_text(json.dumps(summary, indent=2) + "\n")
+        plots.save(best_grasp_picture(observation, result.grasps), options.out / "best_grasp.png")
+    table = Table(title=f"{len(rows)} grasps, the ten best by {options.evaluator}")
+    for name in ("rank", "type", "generator's rank", "score", "refined"):
+        table.add_column(name, justify="left" if name == "type" else "right")
+    for row in rows[:10]:
+        table.add_row(
+            str(row["rank"]), row["type"], str(row["generator_rank"]), f"{row['score']:.3f}", f"{row['refined']:.3f}"
+        )
+    return {"grasps": rows}, table
+
+
+def _plan_rows(result: Plan) -> list[dict[str, Any]]:
+    palms = result.grasps.position[:, GRIP].tolist()
+    parts = zip(
+        result.grasps.grasp_type.tolist(),
+        result.generator_rank.tolist(),
+        result.score.tolist(),
+        result.refined_score.tolist(),
+        palms,
+        strict=True,
+    )
+    return [
+        {
+            "rank": rank,
+            "type": GRASP_TYPES[kind],
+            "generator_rank": place + 1,
+            "score": round(score, 4),
+            "refined": round(refined, 4),
+            "palm": [round(x, 4) for x in palm],
+        }
+        for rank, (kind, place, score, refined, palm) in enumerate(parts, 1)
+    ]
+
+
+def best_grasp_picture(observation: Observation, grasps: Grasps) -> plots.Image:
+    """The depth image with the first grasp's hand at pre-grasp, grip and squeeze."""
+    hand = default_hand()
+    moments = {"pre-grasp": PREGRASP, "grip": GRIP, "squeeze": SQUEEZE}
+    pictures = [plots.overlay_hand(observation, hand, grasps[0], waypoint) for waypoint in moments.values()]
+    return plots.grid(pictures, list(moments), columns=3)
+
+
+def _refine(options: Namespace) -> Result:
+    observation = Observation.load(options.depth, options.camera)
+    grasps = Grasps.load(options.grasps)
+    with _err.status("refining"):
+        result = refine(
+            grasps, observation, options.evaluator, variables=options.variables, num_steps=options.num_steps
+        )
+    if options.out is not None:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        result.grasps.save(options.out)
+    summary = {
+        "num_grasps": len(grasps),
+        "accepted": int(result.accepted.sum()),
+        "mean_score_before": float(result.score_before.mean()) if len(grasps) else None,
+        "mean_score_after": float(result.score_after.mean()) if len(grasps) else None,
+    }
+    return summary, _pairs("refinement", summary)
+
+
+def _verify(options: Namespace) -> Result:
+    obj = _object(options)
+    scene = Scene.place(obj, options.seed)
+    observation = scene.observe(options.seed)
+    if options.grasps is not None:
+        grasps = Grasps.load(options.grasps)
+        scores = [None] * len(grasps)
+        if grasps.frame != "world":
+            raise ValueError(f"{options.grasps} holds grasps in the camera frame; save them with to_frame('world', ...)")
+    else:
+        with _err.status("generating and scoring grasps"):
+            result = plan(observation, options.evaluator, options.num_grasps, 0, options.seed)
+        grasps, scores = result.grasps, result.score.tolist()
+    with _err.status("executing grasps in simulation"):
+        outcomes = verify(grasps, scene, options.seed, options.trials)
+    held = np.flatnonzero(outcomes.success)
+    summary = {
+        "object": obj.name,
+        "num_grasps": len(outcomes),
+        "hold": int(outcomes.success.sum()),
+        "collided": int(outcomes.collided.sum()),
+        "unstable": int(outcomes.unstable.sum()),
+        "success_rate": float(outcomes.success_rate.mean()) if len(outcomes) else None,
+        "first_that_holds": int(held[0]) + 1 if len(held) else None,
+    }
+    rows = [
+        {"rank": rank, "type": GRASP_TYPES[kind], "score": score, "success": bool(held), "collided": bool(hit)}
+        for rank, (kind, score, held, hit) in enumerate(
+            zip(grasps.grasp_type.tolist(), scores, outcomes.success, outcomes.collided, strict=True), 1
+        )
+    ]
+    return {**summary, "grasps": rows}, _pairs(f"verification of {obj.name}", summary)
+
+
+def _object(options: Namespace) -> ObjectModel:
+    if options.object in object_names():
+        named = make_object(options.object)
+        mass = named.mass if options.mass is None else options.mass
+        friction = named.friction if options.friction is None else options.friction
+        return ObjectModel(named.name, named.mesh, named.hulls, mass, friction, named.category)
+    mass = 0.2 if options.mass is None else options.mass
+    friction = 0.7 if options.friction is None else options.friction
+    with _err.status("computing convex parts"):
+        return ObjectModel.from_mesh(options.object, mass, friction, options.hulls)
+
+
+def _collect(options: Namespace) -> Result:
+    if options.scenes < 1 or options.workers < 1:
+        raise ValueError("--scenes and --workers must be at least 1")
+    scenes = options.out / "scenes"
+    for line in collect(scenes, options.scenes, options.workers, options.seed):
+        _err.print(line)
+    merge(scenes, options.out)
+    summary = {"out": str(options.out), "scenes": len(list(scenes.glob("scene_*")))}
+    return summary, _pairs("grasp set", summary)
+
+
+def _models(options: Namespace) -> Result:
+    rows = []
+    table = Table(title="evaluative models")
+    for name in ("name", "weights", "parameters", "test AUROC"):
+        table.add_column(name)
+    for name in list_models():
+        if not shipped(name):
+            rows.append({"name": name, "weights": None})
+            table.add_row(name, f"train with: fit --config {name}.yaml", "", "")
+            continue
+        model = load(name)
+        count = sum(parameter.numel() for parameter in model.parameters())
+        auroc = model.card.get("metrics", {}).get("test_auroc")
+        rows.append({"name": name, "weights": "shipped", "parameters": count, "test_auroc": auroc})
+        table.add_row(name, "shipped", f"{count:,}", "" if auroc is None else f"{auroc:.3f}")
+    return {"models": rows}, table
+
+
+def _pairs(title: str, values: dict[str, Any]) -> Table:
+    table = Table("", "", title=title, show_header=False)
+    for name, value in values.items():
+        table.add_row(name.replace("_", " "), f"{value:.3f}" if isinstance(value, float) else str(value))
+    return table
+
+
+_COMMANDS: dict[str, Callable[[Namespace], Result]] = {
+    "plan": _plan,
+    "refine": _refine,
+    "verify": _verify,
+    "collect": _collect,
+    "models": _models,
+}
