@@ -199,7 +199,9 @@ def _verify(options: Namespace) -> Result:
         grasps = Grasps.load(options.grasps)
         scores = [None] * len(grasps)
         if grasps.frame != "world":
-            raise ValueError(f"{options.grasps} holds grasps in the camera frame; save them with to_frame('world', ...)")
+            raise ValueError(
+                f"{options.grasps} holds grasps in the camera frame; save them with to_frame('world', ...)"
+            )
     else:
         with _err.status("generating and scoring grasps"):
             result = plan(observation, options.evaluator, options.num_grasps, 0, options.seed)

@@ -164,14 +164,20 @@ class Hand(nn.Module):
         """
         poses = self.shape_poses(links)
         half, radius = self._cast(links)[-2:]
-        turn, origin = poses[..., :3, :3], poses[..., :3, 3]
-        local = points[..., None, :, :] @ turn - (origin[..., None, :] @ turn)  # (*batch, shape, point, 3)
-        outside = local.abs() - half[:, None]
-        square = outside.clamp_min(0).square().sum(-1)
-        positive = square > 0  # the root has no gradient at zero
-        distance = torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
-        distance = distance + outside.amax(-1).clamp_max(0) - radius[:, None]
-        return torch.stack([distance[..., group, :].amin(-2) for group in self._shape_groups], dim=-2)
+        inverse = poses[..., :3, :3].mT
+        local = inverse @ points.mT[..., None, :, :] if points.ndim > 2 else inverse @ points.mT
+        local = local - inverse @ poses[..., :3, 3:]  # (*both, shape, 3, point): rows, so that each is one stretch
+        distance = [
+            _capsule_distance(local[..., i, :, :], half[i, 0], radius[i])
+            if shape.is_capsule
+            else _box_distance(local[..., i, :, :], half[i], radius[i])
+            for i, shape in enumerate(self.shapes)
+        ]
+        nearest = [
+            distance[group[0]] if len(group) == 1 else torch.stack([distance[i] for i in group]).amin(0)
+            for group in self._shape_groups
+        ]
+        return torch.stack(nearest, dim=-2)
 
     def clearance(
         self, links: Float[Tensor, "*batch link 4 4"], plane: Float[Tensor, "*plane 4"]
@@ -187,6 +193,23 @@ class Hand(nn.Module):
         reach = ((normal[..., None, :] @ poses[..., :3, :3]).squeeze(-2).abs() * half).sum(-1) + radius
         low = height - reach
         return torch.stack([low[..., group].amin(-1) for group in self._shape_groups], dim=-1)
+
+
+def _capsule_distance(local: Tensor, half: Tensor, radius: Tensor) -> Tensor:
+    """Distances of points (..., 3, point) to a capsule of half length `half` along x."""
+    x, y, z = local.unbind(-2)
+    beyond = (x.abs() - half).clamp_min(0)
+    square = beyond * beyond + y * y + z * z
+    return square.clamp_min(1e-16).sqrt() - radius  # the root has no gradient at zero
+
+
+def _box_distance(local: Tensor, half: Tensor, radius: Tensor) -> Tensor:
+    """Distances of points (..., 3, point) to a box of half sizes `half` rounded by `radius`."""
+    outside = local.abs() - half[:, None]
+    square = outside.clamp_min(0).square().sum(-2)
+    positive = square > 0
+    distance = torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
+    return distance + outside.amax(-2).clamp_max(0) - radius
 
 
 def _joint_terms(joint: Joint) -> NDArray[np.float64]:

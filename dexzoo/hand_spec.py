@@ -34,6 +34,11 @@ class Primitive:
     half: NDArray[np.float64]
     radius: float
 
+    @property
+    def is_capsule(self) -> bool:
+        """Whether it lies along x alone."""
+        return bool(self.radius > 0 and not self.half[1:].any())
+
 
 @dataclass(frozen=True)
 class Joint:

@@ -17,9 +17,9 @@ from dexzoo.refinement import refine
 
 @dataclass(frozen=True)
 class Plan:
-    """Grasps in the camera frame, best first, and for each (num_grasps,):
+    """Grasps in the camera frame, best first, and what is known of each.
 
-    score: probability of success as generated, which ranks them. refined_score: after refinement; equal to score where
+    All (num_grasps,). score: probability of success as generated, which ranks them. refined_score: after refinement; equal to score where
     none was asked for or accepted. generator_rank: place in the generator's own order, 0 the best.
     """
 

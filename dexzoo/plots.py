@@ -35,7 +35,10 @@ def hand_solid(hand: Hand, waypoint: torch.Tensor, colour: tuple[int, int, int] 
     waypoint = waypoint.detach().double()
     wrist = pose_matrix(waypoint[:3], waypoint[3:7])
     poses = (wrist @ hand.shape_poses(hand.forward_kinematics(waypoint[JOINTS]))).numpy()
-    return Solid(trimesh.util.concatenate([m.copy().apply_transform(T) for m, T in zip(_shapes(hand), poses, strict=True)]), colour)
+    return Solid(
+        trimesh.util.concatenate([m.copy().apply_transform(T) for m, T in zip(_shapes(hand), poses, strict=True)]),
+        colour,
+    )
 
 
 def _shapes(hand: Hand) -> list[trimesh.Trimesh]:

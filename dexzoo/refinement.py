@@ -121,7 +121,7 @@ class Objective:
         return logit, logit - sum(WEIGHTS[name] * value for name, value in penalties.items()), penalties
 
     def penalties(self, waypoints: Float[Tensor, "grasp 10 28"]) -> dict[str, Float[Tensor, " grasp"]]:
-        """Deepest reach below the table and into the observed cloud on the way to the grip; excess over joint limits."""
+        """Deepest reach below the table and into the observed cloud before the squeeze; excess over joint limits."""
         way = waypoints[:, _PENALISED]
         wrist = pose_matrix(way[..., POSITION], way[..., QUATERNION])
         links = wrist[:, :, None] @ self.hand.forward_kinematics(way[..., JOINTS])

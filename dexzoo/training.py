@@ -9,6 +9,7 @@ import argparse
 import json
 import logging
 import pickle
+import re
 import shlex
 import sys
 import warnings
@@ -197,6 +198,6 @@ def main(args: list[str]) -> None:
 
 def _reason(error: Exception) -> str:
     """The one line that matters of an error; jsonargparse lists, each after a dash, why no type of several fits."""
-    lines = [line.strip() for line in str(error).splitlines()]
-    reasons = [line.removeprefix("- ") for line in lines if line.startswith("- ") and "NoneType" not in line]
-    return (reasons[0] if reasons else " ".join(lines))[:400]
+    whole, *reasons = [" ".join(part.split()) for part in re.split(r"\n\s*- ", str(error))]
+    reasons = [reason for reason in reasons if "NoneType" not in reason]
+    return (reasons[0] if reasons else whole)[:400]

@@ -31,7 +31,9 @@ def verify(grasps: Grasps, scene: Scene, seed: int = 0, trials: int = 1) -> Outc
     hand.check(grasps.joints)
     if grasps.frame == "camera":
         if scene.T_world_camera is None:
-            raise ValueError("the grasps are in the camera frame, but the scene has not been observed; use to_frame first")
+            raise ValueError(
+                "the grasps are in the camera frame, but the scene has not been observed; use to_frame first"
+            )
         grasps = grasps.to_frame("world", scene.T_world_camera)
     if trials == 1:
         return trial.run(scene, grasps, hand)

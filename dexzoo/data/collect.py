@@ -99,7 +99,10 @@ def choose(outcomes: Outcomes, num: int, rng: np.random.Generator) -> np.ndarray
     """Indices of grasps whose neighbours are to be tried: two thirds around those that hold, if any do."""
     held, failed = np.flatnonzero(outcomes.success), np.flatnonzero(~outcomes.success)
     share = 2 * num // 3 if len(held) and len(failed) else num if len(held) else 0
-    parts = [rng.choice(held, share) if share else held[:0], rng.choice(failed, num - share) if num > share else failed[:0]]
+    parts = [
+        rng.choice(held, share) if share else held[:0],
+        rng.choice(failed, num - share) if num > share else failed[:0],
+    ]
     return np.concatenate(parts)
 
 

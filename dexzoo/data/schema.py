@@ -163,7 +163,9 @@ class GraspSet:
             self.grasp_view = np.array([view_row[pair] for pair in pairs], np.int64)
             self.grasp_scene = np.array([scene_row[scene] for scene in self.grasps["scene"].to_pylist()], np.int64)
         except KeyError as error:
-            raise ValueError(f"{self.folder / 'grasps.parquet'} names scene or view {error}, which is not there") from None
+            raise ValueError(
+                f"{self.folder / 'grasps.parquet'} names scene or view {error}, which is not there"
+            ) from None
         split = np.array([SPLITS.index(name) for name in self.scenes["split"].to_pylist()], np.int64)
         self.grasp_split = split[self.grasp_scene]
         self.view_split = split[[scene_row[scene] for scene in self.views["scene"].to_pylist()]]

@@ -45,10 +45,31 @@ class Preshape:
 
 
 _PRESHAPES = (
-    Preshape(GRASP_TYPES.index("power"), (0, 0.0, 0.15), (0, 1.4, 1.1), ("index", "middle", "ring", "little"), (0.11, 0.17), (-0.02, 0.03)),
-    Preshape(GRASP_TYPES.index("top"), (0, 0.0, 0.3), (0, 1.2, 0.8), ("index", "middle", "ring", "little"), (0.15, 0.20), (-0.02, 0.03)),
-    Preshape(GRASP_TYPES.index("tripod"), (0, 0.1, 0.35), (0, 1.2, 0.7), ("index", "middle"), (0.165, 0.205), (0.0, 0.045)),
-    Preshape(GRASP_TYPES.index("pinch"), (0, 0.1, 0.35), (0, 1.2, 0.7), ("index",), (0.17, 0.205), (0.02, 0.055)),
+    Preshape(
+        GRASP_TYPES.index("power"),
+        (0.0, 0.0, 0.15),
+        (0.0, 1.4, 1.1),
+        ("index", "middle", "ring", "little"),
+        (0.11, 0.17),
+        (-0.02, 0.03),
+    ),
+    Preshape(
+        GRASP_TYPES.index("top"),
+        (0.0, 0.0, 0.3),
+        (0.0, 1.2, 0.8),
+        ("index", "middle", "ring", "little"),
+        (0.15, 0.20),
+        (-0.02, 0.03),
+    ),
+    Preshape(
+        GRASP_TYPES.index("tripod"),
+        (0.0, 0.1, 0.35),
+        (0.0, 1.2, 0.7),
+        ("index", "middle"),
+        (0.165, 0.205),
+        (0.0, 0.045),
+    ),
+    Preshape(GRASP_TYPES.index("pinch"), (0.0, 0.1, 0.35), (0.0, 1.2, 0.7), ("index",), (0.17, 0.205), (0.02, 0.055)),
 )
 _RESTING = (0.0, 0.1, 0.2)  # of fingers that take no part
 
@@ -243,7 +264,9 @@ def complete(observation: Observation, rng: np.random.Generator) -> tuple[NDArra
     turned_normals[:, :2] *= -1
     # what turns out in plain view of the camera would have been seen, so it is not there
     pixels = np.round(observation.camera.project(_to_camera(turned, observation))).astype(int)
-    inside = (pixels >= 0).all(1) & (pixels[:, 0] < observation.camera.width) & (pixels[:, 1] < observation.camera.height)
+    inside = (
+        (pixels >= 0).all(1) & (pixels[:, 0] < observation.camera.width) & (pixels[:, 1] < observation.camera.height)
+    )
     hidden = np.ones(len(turned), bool)
     seen = observation.depth[pixels[inside, 1], pixels[inside, 0]]
     hidden[inside] = (seen == 0) | (_to_camera(turned, observation)[inside, 2] > seen - 0.005)

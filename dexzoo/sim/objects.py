@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-MAX_EXTENT = 1.0
+MIN_EXTENT, MAX_EXTENT = 5e-4, 1.0
 MAX_FRICTION = 2.0
 Mesh = trimesh.Trimesh
 
@@ -48,13 +48,12 @@ class ObjectModel:
         """An object from a mesh file in metres (any format trimesh reads), or from a mesh.
 
         hulls: its convex parts, as files or meshes; None has them computed by CoACD (Wei et al. 2022), which takes
-        seconds to a minute.
+        seconds to a minute. name: by default that of the file, or of its folder where the file is called mesh.
         Raises FileNotFoundError or ValueError for a mesh that is missing, empty, flat, not finite or not in metres.
         """
-        label = name or (Path(mesh).parent.name if isinstance(mesh, (str, Path)) else "object")
-        surface = _read(mesh)
-        _check(surface, str(mesh) if isinstance(mesh, (str, Path)) else label)
-        parts = _decompose(surface) if hulls is None else [_read(hull) for hull in hulls]
+        label = name or ("object" if isinstance(mesh, Mesh) else _name(Path(mesh)))
+        surface = _read(mesh, label)
+        parts = _decompose(surface) if hulls is None else [_read(hull, f"hull of {label}") for hull in hulls]
         if not parts:
             raise ValueError(f"object {label} has no convex parts; give hulls=None to have them computed")
         return cls(label, surface, tuple(part.convex_hull for part in parts), float(mass), float(friction))
@@ -86,19 +85,26 @@ class ObjectModel:
         )
 
 
-def _read(source: str | Path | Mesh) -> Mesh:
+def _name(path: Path) -> str:
+    return path.resolve().parent.name if path.stem == "mesh" else path.stem
+
+
+def _read(source: str | Path | Mesh, label: str) -> Mesh:
+    """A mesh that has passed the checks, its equal vertices merged where it comes from a file."""
     if isinstance(source, Mesh):
+        _check(source, label)
         return source
     path = Path(source)
     if not path.is_file():
         raise FileNotFoundError(f"mesh {path} does not exist")
     try:
-        mesh = trimesh.load(path, force="mesh", process=True)
+        mesh = trimesh.load(path, force="mesh", process=False)  # processing would drop what is not finite
     except Exception as error:  # trimesh raises what its many readers raise
         raise ValueError(f"mesh {path} cannot be read: {error}") from None
     if not isinstance(mesh, Mesh):
         raise ValueError(f"mesh {path} holds no triangles")
-    return mesh
+    _check(mesh, str(path))
+    return mesh.process()
 
 
 def _check(mesh: Mesh, where: str) -> None:
@@ -108,11 +114,11 @@ def _check(mesh: Mesh, where: str) -> None:
         raise ValueError(f"mesh {where} has vertices that are not finite")
     extent = mesh.extents
     if extent.max() > MAX_EXTENT:
+        raise ValueError(f"mesh {where} is {extent.max():.1f} m large and looks like millimetres; divide it by 1000")
+    if extent.min() < MIN_EXTENT:
         raise ValueError(
-            f"mesh {where} is {extent.max():.1f} m large and looks like millimetres; scale it to metres (divide by 1000)"
+            f"mesh {where} is flat: {extent.min() * 1000:.2f} mm thick, expected at least {MIN_EXTENT * 1000:g} mm"
         )
-    if extent.min() < 5e-4:
-        raise ValueError(f"mesh {where} is flat: {extent.min() * 1000:.2f} mm thick, expected at least 0.5 mm")
 
 
 def _decompose(mesh: Mesh) -> list[Mesh]:

@@ -99,10 +99,10 @@ class Scene:
         T_world_camera: NDArray[np.float64] | None = None,
         ideal: bool = False,
     ) -> Observation:
-        """One depth image. Without a pose the camera stands as in the grasp set: elevation 30 to 57 degrees, any
-        azimuth, 0.40 to 0.75 m away, looking within 3 cm of the object's centre.
+        """One depth image, from a given pose or from one drawn as in the grasp set.
 
-        ideal: exact depth instead of the sensor's.
+        A drawn camera stands at an elevation of 30 to 57 degrees and any azimuth, 0.40 to 0.75 m away, and looks within
+        3 cm of the object's centre. ideal: exact depth instead of the sensor's.
         Raises ValueError when the object cannot be seen from there.
         """
         rng = np.random.default_rng(seed)

@@ -7,6 +7,7 @@ touches agree.
 from __future__ import annotations
 
 import zlib
+from itertools import pairwise
 
 import numpy as np
 import trimesh
@@ -36,7 +37,8 @@ def make_object(name: str) -> ObjectModel:
     """The object of that name, always the same; ValueError names what exists."""
     category, _, number = name.rpartition("_")
     if name not in object_names():
-        raise ValueError(f"object {name!r} is unknown; known are {', '.join(f'{c}_00...{n - 1:02d}' for c, n in NUM_OBJECTS.items())}")
+        known = ", ".join(f"{kind}_00...{count - 1:02d}" for kind, count in NUM_OBJECTS.items())
+        raise ValueError(f"object {name!r} is unknown; known are {known}")
     rng = np.random.default_rng([zlib.crc32(category.encode()), int(number)])
     parts, mesh = _MAKERS[category](rng)
     mass = float(rng.uniform(*MASS_RANGE[category]))
@@ -63,23 +65,30 @@ def _bottle(rng: np.random.Generator) -> tuple[list[Mesh], Mesh]:
     body, neck = rng.uniform(0.025, 0.038), rng.uniform(0.011, 0.016)
     body_height, shoulder, neck_height = rng.uniform(0.09, 0.15), rng.uniform(0.02, 0.045), rng.uniform(0.02, 0.05)
     levels = np.cumsum([0, body_height, shoulder, neck_height])
-    return _standing([_frustum(levels[i], levels[i + 1], a, b) for i, (a, b) in enumerate([(body, body), (body, neck), (neck, neck)])])
+    return _standing(
+        [
+            _frustum(levels[i], levels[i + 1], a, b)
+            for i, (a, b) in enumerate([(body, body), (body, neck), (neck, neck)])
+        ]
+    )
 
 
 def _bowl(rng: np.random.Generator) -> tuple[list[Mesh], Mesh]:
     foot, middle, rim = rng.uniform(0.02, 0.03), rng.uniform(0.045, 0.06), rng.uniform(0.06, 0.08)
     height, wall = rng.uniform(0.045, 0.075), rng.uniform(0.003, 0.005)
     profile = [(foot, 0.0), (middle, 0.4 * height), (rim, height)]
-    return _standing([_frustum(0, wall, foot, foot * 1.05), *_wall(profile, wall, sectors=10)])
+    return _standing([_frustum(0.0, wall, foot, foot * 1.05), *_wall(profile, wall, sectors=10)])
 
 
 def _mug(rng: np.random.Generator) -> tuple[list[Mesh], Mesh]:
     radius, height, wall = rng.uniform(0.034, 0.043), rng.uniform(0.08, 0.105), rng.uniform(0.003, 0.005)
-    parts = [_frustum(0, wall, radius, radius), *_wall([(radius, 0.0), (radius, height)], wall, sectors=14)]
+    parts = [_frustum(0.0, wall, radius, radius), *_wall([(radius, 0.0), (radius, height)], wall, sectors=14)]
     reach, thick = rng.uniform(0.025, 0.035), rng.uniform(0.005, 0.007)
     angles = np.linspace(-np.pi / 2, np.pi / 2, 6)
-    arc = np.column_stack((radius - 0.002 + reach * np.cos(angles), 0 * angles, height / 2 + 0.3 * height * np.sin(angles)))
-    for a, b in zip(arc[:-1], arc[1:], strict=True):
+    arc = np.column_stack(
+        (radius - 0.002 + reach * np.cos(angles), 0 * angles, height / 2 + 0.3 * height * np.sin(angles))
+    )
+    for a, b in pairwise(arc):
         ends = [trimesh.creation.icosphere(1, thick).apply_translation(point) for point in (a, b)]
         parts.append(trimesh.util.concatenate(ends).convex_hull)
     return _standing(parts)
@@ -94,13 +103,15 @@ def _ring(radius: float, z: float, angles: NDArray[np.float64]) -> NDArray[np.fl
 
 def _frustum(bottom: float, top: float, radius_bottom: float, radius_top: float) -> Mesh:
     angles = np.linspace(0, 2 * np.pi, _SECTIONS, endpoint=False)
-    return trimesh.convex.convex_hull(np.concatenate((_ring(radius_bottom, bottom, angles), _ring(radius_top, top, angles))))
+    return trimesh.convex.convex_hull(
+        np.concatenate((_ring(radius_bottom, bottom, angles), _ring(radius_top, top, angles)))
+    )
 
 
 def _wall(profile: list[tuple[float, float]], thickness: float, sectors: int) -> list[Mesh]:
     """A wall of revolution along (radius, height) pairs of its outer side, cut into convex sectors."""
     parts = []
-    for (r0, z0), (r1, z1) in zip(profile[:-1], profile[1:], strict=True):
+    for (r0, z0), (r1, z1) in pairwise(profile):
         for k in range(sectors):
             # flat sectors: their outer corners lie on the circle, two steps a sector
             angles = 2 * np.pi / sectors * np.array([k, k + 1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import NamedTuple
 
 import mujoco
@@ -214,7 +215,7 @@ def _run_batch(model: mujoco.MjModel, scene: Scene, grasps: Grasps, hand: Hand, 
     rest_height = run.object_center(np.zeros(1, np.int64))[0, 2]
     lifted = lift_start()
     stops = sorted({*range(0, run.num_steps, _CHUNK), lifted, run.num_steps})
-    for begin, end in zip(stops[:-1], stops[1:], strict=True):
+    for begin, end in pairwise(stops):
         if not len(alive):
             break
         run.advance(alive, begin, end)
