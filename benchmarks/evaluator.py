@@ -7,6 +7,7 @@ Intervals are 95 % bootstrap over scenes. `generated` grasps come first, since t
 import argparse
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -91,10 +92,14 @@ def top1_table(score: np.ndarray, likelihood: np.ndarray, success: np.ndarray, s
     return {
         name: {
             "rate": float(np.mean(rates)),
-            "interval": interval(lambda rows, rates=np.asarray(rates, float): float(rates[rows].mean()), scenes),
+            "interval": interval(partial(mean_of, np.asarray(rates, float)), scenes),
         }
         for name, rates in values.items()
     }
+
+
+def mean_of(values: np.ndarray, rows: np.ndarray) -> float:
+    return float(values[rows].mean())
 
 
 def interval(statistic, groups: np.ndarray) -> list[float]:  # noqa: ANN001, a function of row indices

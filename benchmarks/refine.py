@@ -46,9 +46,7 @@ def main() -> None:
         before.append(dexzoo.verify(grasps, scene).success)
         for name, (variables, steps) in GROUPS.items():
             rate = 0.2 if variables == "grip" else 0.01
-            result = dexzoo.refine(
-                grasps, observation, model, variables=variables, num_steps=steps, learning_rate=rate
-            )
+            result = dexzoo.refine(grasps, observation, model, variables=variables, num_steps=steps, learning_rate=rate)
             outcomes = dexzoo.verify(result.grasps, scene)
             after[name].append(outcomes.success)
             collided[name] += int(outcomes.collided.sum())
@@ -60,9 +58,7 @@ def main() -> None:
         "scenes": len(before),
         "grasps": len(was),
         "success_before": float(was.mean()),
-        "groups": {
-            name: row(before, after[name], collided[name], float(np.mean(rise[name]))) for name in GROUPS
-        },
+        "groups": {name: row(before, after[name], collided[name], float(np.mean(rise[name]))) for name in GROUPS},
     }
     text = json.dumps(result, indent=2)
     if options.out:

@@ -42,11 +42,23 @@ def summary() -> str:
     em2, grip = read("em2"), read("refine")["groups"]["grip: 20 steps, wrist and 15 joints"]
     generated, top1 = em2["generated"], em2["generated"]["top1"]
     rows = [
-        ("AUROC of `em2` on generated grasps of unseen objects", f"{generated['auroc']:.3f} ({span(generated['auroc_interval'])})"),
-        ("success of the grasp that `em2` ranks first", f"{percent(top1['evaluator']['rate'])} ({span(top1['evaluator']['interval'], 100, 1)})"),
-        ("success of the generator's own first", f"{percent(top1['generator']['rate'])} ({span(top1['generator']['interval'], 100, 1)})"),
+        (
+            "AUROC of `em2` on generated grasps of unseen objects",
+            f"{generated['auroc']:.3f} ({span(generated['auroc_interval'])})",
+        ),
+        (
+            "success of the grasp that `em2` ranks first",
+            f"{percent(top1['evaluator']['rate'])} ({span(top1['evaluator']['interval'], 100, 1)})",
+        ),
+        (
+            "success of the generator's own first",
+            f"{percent(top1['generator']['rate'])} ({span(top1['generator']['interval'], 100, 1)})",
+        ),
         ("success of all generated grasps", percent(generated["success_rate"])),
-        ("change of success by refinement guided by `em2`", f"{100 * grip['change']:+.1f} points ({span(grip['change_interval'], 100, 1)})"),
+        (
+            "change of success by refinement guided by `em2`",
+            f"{100 * grip['change']:+.1f} points ({span(grip['change_interval'], 100, 1)})",
+        ),
     ]
     return table(("what, on test objects", "figure (95 % interval over scenes)"), rows)
 
@@ -68,33 +80,75 @@ def counts() -> str:
 def page() -> str:
     em2, refine, meshes = read("em2"), read("refine"), read("meshes")
     parts = [
-        "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % bootstrap over scenes.\n",
+        "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
+        "bootstrap over scenes.\n",
         f"## Evaluator\n\n`benchmarks/evaluator.py`; {em2['objects']} test objects.\n",
         table(
             ("grasps", "number", "scenes", "that hold", "accuracy", "AUROC", "interval"),
             [
-                (name, part["grasps"], part["scenes"], percent(part["success_rate"]), percent(part["accuracy"]), f"{part['auroc']:.3f}", span(part["auroc_interval"]))
+                (
+                    name,
+                    part["grasps"],
+                    part["scenes"],
+                    percent(part["success_rate"]),
+                    percent(part["accuracy"]),
+                    f"{part['auroc']:.3f}",
+                    span(part["auroc_interval"]),
+                )
                 for name, part in (("generated", em2["generated"]), ("with simulated neighbours", em2["all"]))
             ],
         ),
-        f"The generator's own order reaches an AUROC of {em2['generated']['auroc_of_generator_order']:.3f}. The first grasp of each scene holds:\n",
+        f"The generator's own order reaches an AUROC of {em2['generated']['auroc_of_generator_order']:.3f}. "
+        "The first grasp of each scene holds:\n",
         table(
             ("first by", "holds", "interval"),
-            [(name, percent(row["rate"]), span(row["interval"], 100, 1)) for name, row in em2["generated"]["top1"].items()],
-        ),
-        f"## Refinement\n\n`benchmarks/refine.py`; guided by `{refine['evaluator']}`, {refine['grasps']} grasps in {refine['scenes']} scenes of test objects, of which {percent(refine['success_before'])} hold as generated; the same trials before and after.\n",
-        table(
-            ("variables", "hold after", "change, points", "interval", "success to fail", "fail to success", "hit the table", "mean rise of the score"),
             [
-                (name, percent(row["success_after"]), f"{100 * row['change']:+.1f}", span(row["change_interval"], 100, 1), row["success_to_fail"], row["fail_to_success"], row["collided"], f"{row['mean_rise_of_score']:+.3f}")
+                (name, percent(row["rate"]), span(row["interval"], 100, 1))
+                for name, row in em2["generated"]["top1"].items()
+            ],
+        ),
+        f"## Refinement\n\n`benchmarks/refine.py`; guided by `{refine['evaluator']}`, {refine['grasps']} grasps in "
+        f"{refine['scenes']} scenes of test objects, of which {percent(refine['success_before'])} hold as generated; "
+        "the same trials before and after.\n",
+        table(
+            (
+                "variables",
+                "hold after",
+                "change, points",
+                "interval",
+                "success to fail",
+                "fail to success",
+                "hit the table",
+                "mean rise of the score",
+            ),
+            [
+                (
+                    name,
+                    percent(row["success_after"]),
+                    f"{100 * row['change']:+.1f}",
+                    span(row["change_interval"], 100, 1),
+                    row["success_to_fail"],
+                    row["fail_to_success"],
+                    row["collided"],
+                    f"{row['mean_rise_of_score']:+.3f}",
+                )
                 for name, row in refine["groups"].items()
             ],
         ),
-        f"## Meshes from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no part of dexzoo, 50 grasps each from one view, 0.2 kg, friction 0.7. At least one grasp holds for {meshes['objects_with_a_grasp_that_holds']} of {len(meshes['objects'])}.\n",
+        f"## Meshes from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no part of "
+        "dexzoo, 50 grasps each from one view, 0.2 kg, friction 0.7. At least one grasp holds for "
+        f"{meshes['objects_with_a_grasp_that_holds']} of {len(meshes['objects'])}.\n",
         table(
             ("object", "grasps", "hold", "hit the table", "first that holds in em2's order", "in the generator's"),
             [
-                (row["object"], row["grasps"], row["hold"], row["collided"], row["first_that_holds_by_evaluator"] or "none", row["first_that_holds_by_generator"] or "none")
+                (
+                    row["object"],
+                    row["grasps"],
+                    row["hold"],
+                    row["collided"],
+                    row["first_that_holds_by_evaluator"] or "none",
+                    row["first_that_holds_by_generator"] or "none",
+                )
                 if "grasps" in row
                 else (row["object"], row["error"], "", "", "", "")
                 for row in meshes["objects"]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jsonargparse import ArgumentParser, Namespace
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 from dexzoo import plots, training
@@ -19,7 +20,7 @@ from dexzoo.data.collect import collect
 from dexzoo.data.schema import merge
 from dexzoo.grasp import GRASP_TYPES, GRIP, PREGRASP, SQUEEZE, Grasps
 from dexzoo.hand import default_hand
-from dexzoo.models.zoo import list_models, load, shipped
+from dexzoo.models.zoo import list_models, model_class, shipped_card
 from dexzoo.planning import Plan, plan
 from dexzoo.refinement import refine
 from dexzoo.sim import ObjectModel, Scene
@@ -165,10 +166,12 @@ def _plan_rows(result: Plan) -> list[dict[str, Any]]:
 
 
 def best_grasp_picture(observation: Observation, grasps: Grasps) -> plots.Image:
-    """The depth image with the first grasp's hand at pre-grasp, grip and squeeze."""
+    """The depth image around the object, with the first grasp's hand at pre-grasp, grip and squeeze."""
     hand = default_hand()
     moments = {"pre-grasp": PREGRASP, "grip": GRIP, "squeeze": SQUEEZE}
-    pictures = [plots.overlay_hand(observation, hand, grasps[0], waypoint) for waypoint in moments.values()]
+    best = grasps[0].to_frame("world", observation.T_world_camera)
+    aimed = observation.aimed(460)
+    pictures = [plots.overlay_hand(aimed, hand, best, waypoint) for waypoint in moments.values()]
     return plots.grid(pictures, list(moments), columns=3)
 
 
@@ -243,8 +246,9 @@ def _collect(options: Namespace) -> Result:
     if options.scenes < 1 or options.workers < 1:
         raise ValueError("--scenes and --workers must be at least 1")
     scenes = options.out / "scenes"
-    for line in collect(scenes, options.scenes, options.workers, options.seed):
-        _err.print(line)
+    lines = collect(scenes, options.scenes, options.workers, options.seed)
+    for _ in track(lines, "collecting scenes", options.scenes, console=_err, disable=not _err.is_terminal):
+        pass
     merge(scenes, options.out)
     summary = {"out": str(options.out), "scenes": len(list(scenes.glob("scene_*")))}
     return summary, _pairs("grasp set", summary)
@@ -253,18 +257,15 @@ def _collect(options: Namespace) -> Result:
 def _models(options: Namespace) -> Result:
     rows = []
     table = Table(title="evaluative models")
-    for name in ("name", "weights", "parameters", "test AUROC"):
-        table.add_column(name)
+    for heading in ("name", "what", "weights", "validation AUROC"):
+        table.add_column(heading)
     for name in list_models():
-        if not shipped(name):
-            rows.append({"name": name, "weights": None})
-            table.add_row(name, f"train with: fit --config {name}.yaml", "", "")
-            continue
-        model = load(name)
-        count = sum(parameter.numel() for parameter in model.parameters())
-        auroc = model.card.get("metrics", {}).get("test_auroc")
-        rows.append({"name": name, "weights": "shipped", "parameters": count, "test_auroc": auroc})
-        table.add_row(name, "shipped", f"{count:,}", "" if auroc is None else f"{auroc:.3f}")
+        what = (model_class(name).__doc__ or "").splitlines()[0].rstrip(".")
+        card = shipped_card(name)
+        auroc = None if card is None else card.get("metrics", {}).get("validation_auroc")
+        rows.append({"name": name, "what": what, "shipped": card is not None, "validation_auroc": auroc})
+        weights = f"none; fit --config {name}.yaml" if card is None else "shipped"
+        table.add_row(name, what, weights, "" if auroc is None else f"{auroc:.3f}")
     return {"models": rows}, table
 
 

@@ -7,16 +7,28 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from dexzoo.hand_spec import HandSpec, Inertia, Joint, Pad, Primitive, Side
+from dexzoo.kinematics import KinematicTree, LinkPoses
 
 __all__ = ["Hand", "HandSpec", "Inertia", "Joint", "Pad", "Primitive", "Side", "default_hand"]
+
+
+class _Constants(NamedTuple):
+    """A hand's tables as tensors of one dtype on one device."""
+
+    tree: KinematicTree
+    expand: Tensor
+    expand_offset: Tensor
+    shape_pose: Tensor
+    shape_half: Tensor
+    shape_radius: Tensor
 
 
 class Hand(nn.Module):
@@ -41,8 +53,8 @@ class Hand(nn.Module):
         self.register_buffer("lower", torch.tensor([joint.lower for joint in joints], dtype=torch.float32))
         self.register_buffer("upper", torch.tensor([joint.upper for joint in joints], dtype=torch.float32))
         self._prepare_coupling(joints)
-        self._prepare_kinematics()
         self._prepare_shapes()
+        self._constants: dict[tuple[torch.device, torch.dtype], _Constants] = {}
 
     @classmethod
     def load(cls, name: str | Path = "dlr2", side: Side = "right") -> Hand:
@@ -57,27 +69,6 @@ class Hand(nn.Module):
             offset[row] = joint.offset
         self._expand, self._expand_offset = expand, offset
 
-    def _prepare_kinematics(self) -> None:
-        """Joints by depth in the tree, so that one batched product serves all fingers at once."""
-        depth = {self.spec.palm: 0}
-        levels: list[list[Joint]] = []
-        for joint in self.spec.joints:
-            depth[joint.child] = depth[joint.parent] + 1
-            if len(levels) < depth[joint.child]:
-                levels.append([])
-            levels[depth[joint.child] - 1].append(joint)
-        self._levels: list[tuple[list[int], list[int], Tensor]] = []
-        order = [self.spec.palm]
-        before = {self.spec.palm: 0}
-        for level in levels:
-            parents = [before[joint.parent] for joint in level]
-            angles = [self.joint_names.index(joint.name) if joint.axis is not None else -1 for joint in level]
-            self._levels.append((parents, angles, torch.tensor(np.stack([_joint_terms(joint) for joint in level]))))
-            before = {joint.child: i for i, joint in enumerate(level)}
-            order += [joint.child for joint in level]
-        self._unsort = [order.index(name) for name in self.link_names]
-        self._constants: dict[tuple[torch.device, torch.dtype], tuple[Tensor, ...]] = {}
-
     def _prepare_shapes(self) -> None:
         solid_links = {shape.link for shape in self.spec.primitives}
         self.solid_names = [name for name in self.link_names if name in solid_links]
@@ -90,22 +81,22 @@ class Hand(nn.Module):
         self._shape_half = torch.tensor(np.stack([shape.half for shape in shapes]))
         self._shape_radius = torch.tensor([shape.radius for shape in shapes], dtype=torch.float64)
 
-    def _cast(self, like: Tensor) -> tuple[Tensor, ...]:
+    def _cast(self, like: Tensor) -> _Constants:
         """Every constant in the dtype and on the device of a tensor, kept for the next call."""
         key = (like.device, like.dtype)
         if key not in self._constants:
-            constants = [level[2] for level in self._levels]
-            constants += [self._expand, self._expand_offset, self._shape_pose, self._shape_half, self._shape_radius]
+            values = (self._expand, self._expand_offset, self._shape_pose, self._shape_half, self._shape_radius)
             with torch.inference_mode(False):  # else a first call in inference mode would bar gradients from then on
-                self._constants[key] = tuple(value.to(*key) for value in constants)
+                tree = KinematicTree(self.spec, like.dtype, like.device)
+                self._constants[key] = _Constants(tree, *(value.to(*key) for value in values))
         return self._constants[key]
 
     def expand(self, q15: Float[Tensor, "*batch freedom"]) -> Float[Tensor, "*batch joint"]:
         """All joint angles from the free ones: the coupled joints follow."""
         if q15.shape[-1] != len(self.freedoms):
             raise ValueError(f"expand takes the {len(self.freedoms)} free joints, got {q15.shape[-1]} angles")
-        matrix, offset = self._cast(q15)[len(self._levels) : len(self._levels) + 2]
-        return q15 @ matrix.T + offset
+        constants = self._cast(q15)
+        return q15 @ constants.expand.T + constants.expand_offset
 
     def reduce(self, q20: Float[Tensor, "*batch joint"]) -> Float[Tensor, "*batch freedom"]:
         """The free joints among all; the inverse of `expand` on postures that keep the coupling."""
@@ -131,28 +122,14 @@ class Hand(nn.Module):
             raise ValueError(f"a posture has {len(self.joint_names)} joint angles, got {q20.shape[-1]}{hint}")
 
     def forward_kinematics(self, q20: Float[Tensor, "*batch joint"]) -> Float[Tensor, "*batch link 4 4"]:
-        """Poses of all links in the palm frame, in the order of `link_names`.
-
-        Each joint's transform is O + sin(a) O K + (1 - cos(a)) O K K (Rodrigues), with O its origin and K the cross
-        product matrix of its axis.
-        """
+        """Poses of all links in the palm frame, in the order of `link_names`; differentiable once."""
         self._check_size(q20)
-        batch = q20.shape[:-1]
-        q = q20.reshape(-1, q20.shape[-1])
-        sin = torch.cat((torch.sin(q), q.new_zeros(len(q), 1)), dim=-1)  # the last column serves fixed joints
-        one_minus_cos = torch.cat((1 - torch.cos(q), q.new_zeros(len(q), 1)), dim=-1)
-        pose = torch.eye(4, dtype=q.dtype, device=q.device).expand(len(q), 1, 4, 4)
-        poses = [pose]
-        for (parents, angles, _), terms in zip(self._levels, self._cast(q), strict=False):
-            weights = torch.stack((torch.ones_like(sin[:, angles]), sin[:, angles], one_minus_cos[:, angles]), dim=-1)
-            step = torch.einsum("bjk,jkrc->bjrc", weights, terms)
-            pose = pose[:, parents] @ step
-            poses.append(pose)
-        return torch.cat(poses, dim=1)[:, self._unsort].reshape(*batch, len(self.link_names), 4, 4)
+        poses: Tensor = LinkPoses.apply(q20.reshape(-1, q20.shape[-1]), self._cast(q20).tree)
+        return poses.reshape(*q20.shape[:-1], len(self.link_names), 4, 4)
 
     def shape_poses(self, links: Float[Tensor, "*batch link 4 4"]) -> Float[Tensor, "*batch shape 4 4"]:
         """Poses of the primitives, given those of the links."""
-        return links[..., self._shape_link, :, :] @ self._cast(links)[-3]
+        return links[..., self._shape_link, :, :] @ self._cast(links).shape_pose
 
     def signed_distance(
         self, links: Float[Tensor, "*batch link 4 4"], points: Float[Tensor, "*cloud point 3"]
@@ -163,7 +140,7 @@ class Hand(nn.Module):
         boxes; where several primitives make one link, the nearest counts.
         """
         poses = self.shape_poses(links)
-        half, radius = self._cast(links)[-2:]
+        half, radius = self._cast(links).shape_half, self._cast(links).shape_radius
         inverse = poses[..., :3, :3].mT
         local = inverse @ points.mT[..., None, :, :] if points.ndim > 2 else inverse @ points.mT
         local = local - inverse @ poses[..., :3, 3:]  # (*both, shape, 3, point): rows, so that each is one stretch
@@ -187,7 +164,7 @@ class Hand(nn.Module):
         plane: unit normal and offset in the frame of the link poses; broadcasts against them.
         """
         poses = self.shape_poses(links)
-        half, radius = self._cast(links)[-2:]
+        half, radius = self._cast(links).shape_half, self._cast(links).shape_radius
         normal, offset = plane[..., None, :3], plane[..., None, 3]
         height = (poses[..., :3, 3] * normal).sum(-1) + offset
         reach = ((normal[..., None, :] @ poses[..., :3, :3]).squeeze(-2).abs() * half).sum(-1) + radius
@@ -210,17 +187,6 @@ def _box_distance(local: Tensor, half: Tensor, radius: Tensor) -> Tensor:
     positive = square > 0
     distance = torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
     return distance + outside.amax(-2).clamp_max(0) - radius
-
-
-def _joint_terms(joint: Joint) -> NDArray[np.float64]:
-    """(3, 4, 4): the constant, sine and 1 - cosine terms of a joint's transform."""
-    zero = np.zeros((4, 4))
-    if joint.axis is None:
-        return np.stack((joint.origin, zero, zero))
-    x, y, z = joint.axis
-    cross = np.zeros((4, 4))
-    cross[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    return np.stack((joint.origin, joint.origin @ cross, joint.origin @ cross @ cross))
 
 
 @lru_cache(maxsize=4)

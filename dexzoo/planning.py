@@ -19,8 +19,8 @@ from dexzoo.refinement import refine
 class Plan:
     """Grasps in the camera frame, best first, and what is known of each.
 
-    All (num_grasps,). score: probability of success as generated, which ranks them. refined_score: after refinement; equal to score where
-    none was asked for or accepted. generator_rank: place in the generator's own order, 0 the best.
+    All (num_grasps,). score: probability of success as generated, which ranks them. refined_score: after refinement;
+    equal to score where none was asked for or accepted. generator_rank: place in the generator's own order, 0 the best.
     """
 
     grasps: Grasps

@@ -35,10 +35,14 @@ def hand_solid(hand: Hand, waypoint: torch.Tensor, colour: tuple[int, int, int] 
     waypoint = waypoint.detach().double()
     wrist = pose_matrix(waypoint[:3], waypoint[3:7])
     poses = (wrist @ hand.shape_poses(hand.forward_kinematics(waypoint[JOINTS]))).numpy()
-    return Solid(
-        trimesh.util.concatenate([m.copy().apply_transform(T) for m, T in zip(_shapes(hand), poses, strict=True)]),
-        colour,
-    )
+    meshes = [mesh.copy().apply_transform(T) for mesh, T in zip(_shapes(hand), poses, strict=True)]
+    return Solid(_joined(meshes), colour)
+
+
+def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    joined = trimesh.util.concatenate(meshes)
+    assert isinstance(joined, trimesh.Trimesh)  # what meshes alone make
+    return joined
 
 
 def _shapes(hand: Hand) -> list[trimesh.Trimesh]:
@@ -72,7 +76,7 @@ def render(
         squares = (np.floor(point[:, 0] / 0.1) + np.floor(point[:, 1] / 0.1)) % 2
         depth[hit] = t[hit]
         colour[hit] = np.array(TABLE_COLOUR) - 10 * squares[:, None]
-    mesh = trimesh.util.concatenate([solid.mesh for solid in solids])
+    mesh = _joined([solid.mesh for solid in solids])
     faces = np.concatenate([np.full(len(solid.mesh.faces), i) for i, solid in enumerate(solids)])
     triangle, ray, point = mesh.ray.intersects_id(
         np.broadcast_to(origin, directions.shape), directions, multiple_hits=False, return_locations=True
@@ -138,6 +142,8 @@ def grid(pictures: Sequence[Image], titles: Sequence[str], columns: int) -> Imag
 
 def save(picture: Image, path: Path) -> None:
     """Write an RGB picture as PNG."""
+    done, png = cv2.imencode(".png", picture[..., ::-1])
+    if not done:
+        raise OSError(f"picture {path} could not be encoded as PNG")
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), picture[..., ::-1]):
-        raise OSError(f"picture {path} could not be written")
+    path.write_bytes(png.tobytes())

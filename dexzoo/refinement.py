@@ -34,6 +34,8 @@ CUBE = 0.005
 """Half side in metres of the cube that the thesis kept the wrist in."""
 WEIGHTS = {"table": 300.0, "penetration": 300.0, "limits": 30.0}
 """Log-odds that a metre (a radian for limits) of each penalty costs."""
+MIN_RISE = 1e-4
+"""Log-odds by which the objective must rise; less may be rounding."""
 _PENALISED = (0, 2, 4, GRIP)  # waypoints at which table and penetration are looked at
 _NUM_POINTS = 256
 _CHUNK = 128
@@ -47,7 +49,7 @@ class Refinement:
 
     grasps: the refined grasp where accepted, else the one given; same order and frame as given.
     score_before, score_after: probability of success of the given and of the returned grasps.
-    accepted: whether the objective (log-odds less weighted penalties) rose.
+    accepted: whether the objective rose: for "grip" the log-odds less weighted penalties, else the log-odds.
     penalties: of the returned grasps: "table", deepest metres below the table; "penetration", deepest metres of an
     observed point in a link before the squeeze; "limits", radians beyond the joint limits.
     """
@@ -95,17 +97,22 @@ def refine(
         else:
             first = 0 if variables == "waypoints" else NUM_WAYPOINTS - 3
             parts.append(_ascend_waypoints(chunk, objective, hand, num_steps, learning_rate, first, on_step))
-    proposed = torch.cat(parts) if parts else world.waypoints
-    with torch.no_grad():
-        before, value_before, _ = objective(world.waypoints)
-        after, value_after, _ = objective(proposed)
-        rose = value_after > value_before if variables == "grip" else after > before
-        accepted = rose & torch.isfinite(proposed).flatten(1).all(1)
-        waypoints = torch.where(accepted[:, None, None], proposed, world.waypoints)
-        penalties = objective.penalties(waypoints)
-    refined = Grasps(waypoints, "world", grasps.log_likelihood).to_frame(grasps.frame, observation.T_world_camera)
-    score_after = torch.where(accepted, after, before).sigmoid()
-    return Refinement(refined, before.sigmoid(), score_after, accepted, penalties)
+    proposed = torch.cat(parts)
+    before, value_before, penalties_before = objective.judge(world.waypoints)
+    after, value_after, penalties_after = objective.judge(proposed)
+    rise = value_after - value_before if variables == "grip" else after - before
+    accepted = (rise > MIN_RISE) & torch.isfinite(proposed).flatten(1).all(1)
+    chosen = torch.where(accepted[:, None, None], proposed, world.waypoints)
+    refined = Grasps(chosen, "world").to_frame(grasps.frame, observation.T_world_camera).waypoints
+    # what is not accepted is handed back itself, not by way of the world frame and its rounding
+    refined = torch.where(accepted[:, None, None], refined, grasps.waypoints.detach())
+    return Refinement(
+        Grasps(refined, grasps.frame, grasps.log_likelihood),
+        before.sigmoid(),
+        torch.where(accepted, after, before).sigmoid(),
+        accepted,
+        {name: torch.where(accepted, penalties_after[name], penalties_before[name]) for name in WEIGHTS},
+    )
 
 
 class Objective:
@@ -119,6 +126,13 @@ class Objective:
         logit = self.view.logit(waypoints)
         penalties = self.penalties(waypoints)
         return logit, logit - sum(WEIGHTS[name] * value for name, value in penalties.items()), penalties
+
+    @torch.no_grad()
+    def judge(self, waypoints: Float[Tensor, "grasp 10 28"]) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """The same without gradients, piece by piece, so that memory is bounded."""
+        parts = [self(chunk) for chunk in waypoints.split(_CHUNK)]
+        penalties = {name: torch.cat([part[2][name] for part in parts]) for name in WEIGHTS}
+        return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts]), penalties
 
     def penalties(self, waypoints: Float[Tensor, "grasp 10 28"]) -> dict[str, Float[Tensor, " grasp"]]:
         """Deepest reach below the table and into the observed cloud before the squeeze; excess over joint limits."""
@@ -193,7 +207,7 @@ def _ascend_grip(
             on_step(step, value.detach())
         if step < num_steps:
             (gradient,) = torch.autograd.grad(-value.sum(), free)
-            free.grad = gradient.nan_to_num(0.0)
+            free.grad = gradient.nan_to_num(0.0, 0.0, 0.0)
             optimiser.step()
     return best
 
@@ -214,7 +228,7 @@ def _ascend_waypoints(
         free = waypoints.clone().requires_grad_()
         logit = objective.view.logit(free)
         (gradient,) = torch.autograd.grad(logit.sum(), free)
-        waypoints = waypoints + learning_rate * mask * gradient.nan_to_num(0.0)
+        waypoints = waypoints + learning_rate * mask * gradient.nan_to_num(0.0, 0.0, 0.0)
         position = start[..., POSITION] + (waypoints[..., POSITION] - start[..., POSITION]).clamp(-CUBE, CUBE)
         quaternion = rotation.normalize(waypoints[..., QUATERNION])
         joints = torch.minimum(torch.maximum(waypoints[..., JOINTS], hand.lower), hand.upper)

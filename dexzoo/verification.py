@@ -44,7 +44,7 @@ def verify(grasps: Grasps, scene: Scene, seed: int = 0, trials: int = 1) -> Outc
             scene.object, mass=scene.object.mass * float(rng.uniform(0.8, 1.2)), friction=float(rng.uniform(0.5, 1.0))
         )
         runs.append(trial.run(replace(scene, object=obj), _displaced(grasps, rng), hand))
-    rate = np.mean([run.success for run in runs], axis=0, dtype=np.float32)
+    rate = np.stack([run.success for run in runs]).mean(0, dtype=np.float32)
     return replace(runs[0], success_rate=rate)
 
 

@@ -52,7 +52,9 @@ def main() -> None:
 
     best = int(np.flatnonzero(outcomes.success)[0]) if outcomes.success.any() else 0
     plots.save(best_grasp_picture(observation, plan.grasps[best]), options.out / "grasp.png")
-    plots.save(lift_picture(scene, plan.grasps[best].to_frame("world", observation.T_world_camera)), options.out / "lift.png")
+    plots.save(
+        lift_picture(scene, plan.grasps[best].to_frame("world", observation.T_world_camera)), options.out / "lift.png"
+    )
     console.print(f"Pictures of the grasp ranked {best + 1}: {options.out / 'grasp.png'}, {options.out / 'lift.png'}")
 
 

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -11,16 +10,19 @@ import jaxtyping
 import pytest
 import torch
 
-if TYPE_CHECKING:  # at run time only after the hook is installed
-    from dexzoo.camera import Observation
-    from dexzoo.grasp import Grasps
-    from dexzoo.hand import Hand
-    from dexzoo.sim import Outcomes, Scene
-
 jaxtyping.install_import_hook("dexzoo", "beartype.beartype")
 torch.set_num_threads(1)
 hypothesis.settings.register_profile("dexzoo", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("dexzoo")
+
+# only now, so that the hook reaches them
+from dexzoo.camera import Observation  # noqa: E402
+from dexzoo.generators.heuristic import HeuristicGenerator  # noqa: E402
+from dexzoo.grasp import Grasps  # noqa: E402
+from dexzoo.hand import Hand, default_hand  # noqa: E402
+from dexzoo.sim import Outcomes, Scene  # noqa: E402
+from dexzoo.sim.shapes import make_object  # noqa: E402
+from dexzoo.verification import verify  # noqa: E402
 
 
 @pytest.fixture
@@ -35,35 +37,26 @@ def as_users_run_it() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def hand() -> "Hand":
-    from dexzoo.hand import default_hand
-
+def hand() -> Hand:
     return default_hand()
 
 
 @pytest.fixture(scope="session")
-def can_scene() -> "Scene":
-    from dexzoo.sim import Scene
-    from dexzoo.sim.shapes import make_object
-
+def can_scene() -> Scene:
     return Scene.place(make_object("can_05"), seed=0)
 
 
 @pytest.fixture(scope="session")
-def can_view(can_scene: "Scene") -> "Observation":
+def can_view(can_scene: Scene) -> Observation:
     return can_scene.observe(seed=1)
 
 
 @pytest.fixture(scope="session")
-def can_grasps(can_view: "Observation") -> "Grasps":
+def can_grasps(can_view: Observation) -> Grasps:
     """Fifty grasps in the frame of the camera, of which about ten hold."""
-    from dexzoo.generators.heuristic import HeuristicGenerator
-
     return HeuristicGenerator(num_samples=800).generate(can_view, 50, seed=0)
 
 
 @pytest.fixture(scope="session")
-def can_outcomes(can_scene: "Scene", can_grasps: "Grasps") -> "Outcomes":
-    from dexzoo.verification import verify
-
+def can_outcomes(can_scene: Scene, can_grasps: Grasps) -> Outcomes:
     return verify(can_grasps, can_scene)

@@ -16,6 +16,7 @@ LAYERS = [
     {"rotation", "resources"},
     {"grasp", "camera"},
     {"hand_spec"},
+    {"kinematics"},
     {"hand"},
     {"metrics", "sim", "generators"},
     {"models"},

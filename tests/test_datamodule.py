@@ -151,3 +151,9 @@ def test_a_folder_is_also_looked_up_beside_the_package(tmp_path: Path, monkeypat
     assert GraspDataModule("robots/dlr2").folder.is_dir()
     (tmp_path / "robots" / "dlr2").mkdir(parents=True)
     assert GraspDataModule("robots/dlr2").folder == Path("robots/dlr2")
+
+
+def test_fewer_scenes(folder: Path, em2: EM2, tmp_path: Path) -> None:
+    dataset = GraspDataModule(str(folder), num_scenes=2, cache=str(tmp_path)).dataset("train", em2)
+    assert dataset.scene_index.unique().tolist() == [0, 1]
+    assert len(dataset) == 80

@@ -255,7 +255,7 @@ def test_fit_writes_a_run_that_load_and_the_other_commands_take(
     card = json.loads(weights.with_suffix(".json").read_text())
     assert card["seed"] == 5
     assert card["arguments"]["width"] == 64
-    assert card["command"].startswith("python -m dexzoo fit --config smoke.yaml")
+    assert card["command"].startswith("python -m dexzoo fit --config=smoke.yaml")
     assert card["data"]["train_grasps"] == 160
     assert card["metrics"].keys() >= {"validation_auroc", "validation_top1", "validation_loss"}
     assert isinstance(zoo.load(weights.parent), EM2)

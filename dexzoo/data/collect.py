@@ -35,12 +35,13 @@ def split_of(name: str) -> str:
 
 
 def collect(folder: Path, num_scenes: int, workers: int = 1, seed: int = 0) -> Iterator[str]:
-    """Write scenes 0...num_scenes - 1 that are not yet in `folder`; yields a line on each as it is done.
+    """Write scenes 0...num_scenes - 1 that are not yet in `folder`; yields a line on each, those kept first.
 
     The same seed makes the same files on any number of workers. Killing it loses the scenes in flight.
     """
     folder.mkdir(parents=True, exist_ok=True)
     missing = [i for i in range(num_scenes) if not (folder / f"scene_{i:06d}").exists()]
+    yield from (f"scene {i} is there already" for i in range(num_scenes) if i not in set(missing))
     if workers == 1:
         for index in missing:
             yield collect_scene(folder, seed, index)

@@ -64,6 +64,7 @@ class GraspDataModule(LightningDataModule):
     folder: the set (`dexzoo.data.schema`); a relative one is looked up in the working folder, then beside the package.
     batch_size: grasps in a batch; training draws as many successes as failures, with replacement.
     predict_split: the split that `predict` runs over.
+    num_scenes: use only the first so many scenes of each split, to try things out.
     cache: where encoded views are kept; by default the user's cache folder.
     seed: of the drawing.
 
@@ -77,6 +78,7 @@ class GraspDataModule(LightningDataModule):
         folder: str = "assets/grasps",
         batch_size: int = 64,
         predict_split: str = "test",
+        num_scenes: int | None = None,
         cache: str | None = None,
         seed: int = 0,
     ) -> None:
@@ -88,6 +90,7 @@ class GraspDataModule(LightningDataModule):
         beside = resource(folder)
         self.folder = beside if beside.exists() and not Path(folder).exists() else Path(folder)
         self.batch_size, self.predict_split, self.seed = batch_size, predict_split, seed
+        self.num_scenes = num_scenes
         self.cache = Path(cache) if cache else _user_cache()
 
     @cached_property
@@ -108,9 +111,9 @@ class GraspDataModule(LightningDataModule):
 
     def fit_statistics(self, model: GraspEvaluator) -> None:
         """Set the model's standardisation from the training split."""
-        views = np.flatnonzero(self.source.view_split == SPLITS.index("train"))
-        views = views[np.linspace(0, len(views) - 1, min(len(views), STATISTICS_VIEWS)).astype(int)]
         rows = self._rows("train")
+        views = np.unique(self.source.grasp_view[rows])
+        views = views[np.linspace(0, len(views) - 1, min(len(views), STATISTICS_VIEWS)).astype(int)]
         images = torch.stack([self.source.observation(int(view)).image() for view in views])
         model.fit_statistics(images.to(model.device), self.waypoints[rows].to(model.device))
 
@@ -179,6 +182,9 @@ class GraspDataModule(LightningDataModule):
         rows = np.flatnonzero(self.source.grasp_split == SPLITS.index(split))
         if not len(rows):
             raise ValueError(f"grasp set {self.folder} has no grasps in its {split} split; collect more objects")
+        if self.num_scenes is not None:
+            scene = self.source.grasp_scene[rows]
+            rows = rows[np.isin(scene, np.unique(scene)[: self.num_scenes])]
         return torch.from_numpy(rows)
 
     def _encode(self, rows: list[int], model: GraspEvaluator) -> Scene:

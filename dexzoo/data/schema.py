@@ -92,6 +92,8 @@ def encode_view(observation: Observation) -> dict[str, Any]:
 def decode_view(row: dict[str, Any]) -> Observation:
     """The aimed observation of a row of views.parquet."""
     image = cv2.imdecode(np.frombuffer(row["depth"], np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.shape != (IMAGE_SIZE, IMAGE_SIZE):
+        raise ValueError(f"the depth of scene {row['scene']}, view {row['view']} is no {IMAGE_SIZE} x {IMAGE_SIZE} PNG")
     depth = image.astype(np.float32) * np.float32(DEPTH_UNIT)
     pose = np.array(row["T_world_camera"], np.float64).reshape(4, 4)
     return Observation(depth, AIMED_CAMERA, pose, mask=depth > 0)

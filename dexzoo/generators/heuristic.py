@@ -89,6 +89,8 @@ class HeuristicGenerator(GraspGenerator):
 
         Raises ValueError when too little of the object is seen, RuntimeError when no candidate is feasible.
         """
+        if num_grasps < 1:
+            raise ValueError(f"num_grasps is {num_grasps}, expected at least 1")
         rng = np.random.default_rng(seed)
         cloud, normals = complete(observation, rng)
         position, quaternion, shape = self._sample(cloud, normals, rng)

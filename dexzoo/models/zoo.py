@@ -62,6 +62,12 @@ def load(name_or_path: str | Path) -> GraspEvaluator:
     return _read(path)
 
 
+def shipped_card(name: str) -> dict[str, Any] | None:
+    """The card of the weights that come with dexzoo under a name of `list_models`; None where there are none."""
+    path = resource("checkpoints") / f"{name}.safetensors"
+    return _read_card(path) if path.is_file() else None
+
+
 def _shipped(name: str) -> Path:
     path = resource("checkpoints") / f"{name}.safetensors"
     if not path.is_file():

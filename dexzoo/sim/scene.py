@@ -111,14 +111,13 @@ class Scene:
         depth, normals, on_object = self._cast(camera, pose)
         if on_object.sum() < MIN_PIXELS:
             raise ValueError(f"object {self.object.name} covers {on_object.sum()} pixels, fewer than {MIN_PIXELS}")
-        if not ideal:
-            depth = add_sensor_noise(depth, camera, rng, normals)
-        observation = Observation(depth, camera, pose)
+        seen = depth if ideal else add_sensor_noise(depth, camera, rng, normals)
+        observation = Observation(seen, camera, pose)
         self.T_world_camera = pose
         return observation
 
     def _center(self) -> NDArray[np.float64]:
-        middle = self.object.mesh.bounds.mean(0)
+        middle: NDArray[np.float64] = self.object.mesh.bounds.mean(0)
         return self.T_world_object[:3, :3] @ middle + self.T_world_object[:3, 3]
 
     def _cast(

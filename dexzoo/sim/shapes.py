@@ -89,8 +89,8 @@ def _mug(rng: np.random.Generator) -> tuple[list[Mesh], Mesh]:
         (radius - 0.002 + reach * np.cos(angles), 0 * angles, height / 2 + 0.3 * height * np.sin(angles))
     )
     for a, b in pairwise(arc):
-        ends = [trimesh.creation.icosphere(1, thick).apply_translation(point) for point in (a, b)]
-        parts.append(trimesh.util.concatenate(ends).convex_hull)
+        ends = [trimesh.creation.icosphere(1, thick).apply_translation(point).vertices for point in (a, b)]
+        parts.append(_hull(*ends))
     return _standing(parts)
 
 
@@ -101,11 +101,14 @@ def _ring(radius: float, z: float, angles: NDArray[np.float64]) -> NDArray[np.fl
     return np.column_stack((radius * np.cos(angles), radius * np.sin(angles), np.full(len(angles), z)))
 
 
+def _hull(*points: NDArray[np.float64]) -> Mesh:
+    hull: Mesh = trimesh.convex.convex_hull(np.concatenate(points))
+    return hull
+
+
 def _frustum(bottom: float, top: float, radius_bottom: float, radius_top: float) -> Mesh:
     angles = np.linspace(0, 2 * np.pi, _SECTIONS, endpoint=False)
-    return trimesh.convex.convex_hull(
-        np.concatenate((_ring(radius_bottom, bottom, angles), _ring(radius_top, top, angles)))
-    )
+    return _hull(_ring(radius_bottom, bottom, angles), _ring(radius_top, top, angles))
 
 
 def _wall(profile: list[tuple[float, float]], thickness: float, sectors: int) -> list[Mesh]:
@@ -116,7 +119,7 @@ def _wall(profile: list[tuple[float, float]], thickness: float, sectors: int) ->
             # flat sectors: their outer corners lie on the circle, two steps a sector
             angles = 2 * np.pi / sectors * np.array([k, k + 1])
             corners = [_ring(r, z, angles) for r, z in ((r0, z0), (r1, z1), (r0 - thickness, z0), (r1 - thickness, z1))]
-            parts.append(trimesh.convex.convex_hull(np.concatenate(corners)))
+            parts.append(_hull(*corners))
     return parts
 
 

@@ -1,0 +1,222 @@
+"""The trial: what counts as success, and that it counts alike however it is run."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dexzoo.camera import Observation
+from dexzoo.grasp import Grasps
+from dexzoo.hand import Hand
+from dexzoo.sim import Outcomes, Scene, trial
+from dexzoo.verification import verify
+
+
+@pytest.fixture(scope="module")
+def world_grasps(can_grasps: Grasps, can_view: Observation) -> Grasps:
+    return can_grasps.to_frame("world", can_view.T_world_camera)
+
+
+@pytest.fixture(scope="module")
+def some(can_outcomes: Outcomes) -> np.ndarray:
+    """Indices of a dozen grasps, half of which hold."""
+    held, failed = np.flatnonzero(can_outcomes.success), np.flatnonzero(~can_outcomes.success)
+    return np.sort(np.concatenate((held[:6], failed[:6])))
+
+
+@pytest.fixture(scope="module")
+def good(world_grasps: Grasps, can_outcomes: Outcomes) -> Grasps:
+    return world_grasps[np.flatnonzero(can_outcomes.success)]
+
+
+def moved(grasps: Grasps, offset: list[float]) -> Grasps:
+    waypoints = grasps.waypoints.clone()
+    waypoints[..., :3] += torch.tensor(offset)
+    return Grasps(waypoints, grasps.frame)
+
+
+def assert_equal(first: Outcomes, second: Outcomes) -> None:
+    for field in fields(Outcomes):
+        np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name), err_msg=field.name)
+
+
+# what is success
+
+
+def test_some_grasps_hold_and_some_do_not(can_outcomes: Outcomes) -> None:
+    assert 5 <= can_outcomes.success.sum() <= 40
+    assert not (can_outcomes.success & can_outcomes.collided).any()
+    assert not can_outcomes.unstable.any()
+    lost = np.isfinite(can_outcomes.lost_at)
+    np.testing.assert_array_equal(can_outcomes.success, ~lost & ~can_outcomes.collided & ~can_outcomes.unstable)
+    for motion in (can_outcomes.shift, can_outcomes.rotation):
+        np.testing.assert_array_equal(np.isfinite(motion), can_outcomes.success)
+        assert (motion[can_outcomes.success] >= 0).all()
+    assert can_outcomes.shift[can_outcomes.success].max() < 0.1
+    assert can_outcomes.lost_at[lost].max() <= trial.LIFT + trial.HOLD
+    np.testing.assert_array_equal(can_outcomes.success_rate, can_outcomes.success)
+
+
+def test_the_object_of_a_good_grasp_is_lifted_one_metre_and_held(can_scene: Scene, good: Grasps, hand: Hand) -> None:
+    times = [-0.02, trial.LIFT / 2, trial.LIFT, trial.LIFT + trial.HOLD]
+    moments = trial.replay(can_scene, good[0], hand, times)
+    rest = can_scene.T_world_object[2, 3]
+    heights = [moment.T_world_object[2, 3] - rest for moment in moments]
+    np.testing.assert_allclose(heights, [0, 0.5, 1.0, 1.0], atol=0.05)
+    wrist = [float(moment.waypoint[2]) for moment in moments]
+    np.testing.assert_allclose(np.diff(wrist), [0.5, 0.5, 0], atol=0.02)
+
+
+def test_a_replay_ends_as_the_trial_did(
+    can_scene: Scene, world_grasps: Grasps, can_outcomes: Outcomes, hand: Hand
+) -> None:
+    def shift(grasp: Grasps) -> float:
+        gripped, held = (
+            np.linalg.inv(trial.pose_matrix(m.waypoint[:3], m.waypoint[3:7]).numpy()) @ m.T_world_object
+            for m in trial.replay(can_scene, grasp, hand, [0.0, trial.LIFT + trial.HOLD])
+        )
+        return float(np.linalg.norm(gripped[:3, 3] - held[:3, 3]))
+
+    held = np.flatnonzero(can_outcomes.success)[:2]
+    for index in held:
+        assert shift(world_grasps[index]) == pytest.approx(can_outcomes.shift[index], abs=1e-5)
+    failed = int(np.flatnonzero(~can_outcomes.success)[0])
+    assert shift(world_grasps[failed]) > 0.1
+
+
+def test_grasps_that_miss_lose_the_object(can_scene: Scene, good: Grasps, hand: Hand) -> None:
+    outcomes = trial.run(can_scene, moved(good, [0.0, 0.0, 0.25]), hand)
+    assert not outcomes.success.any()
+    assert not outcomes.collided.any()
+    assert ((outcomes.lost_at > 0) & (outcomes.lost_at < trial.LIFT)).all()
+    far = trial.run(can_scene, moved(good[:2], [2.0, 0.0, 0.0]), hand)
+    assert not far.success.any()
+    assert np.isfinite(far.lost_at).all()
+
+
+def test_a_path_into_the_table_is_not_executed(can_scene: Scene, good: Grasps, hand: Hand) -> None:
+    low = good.position[:, :7, 2].amin()
+    outcomes = trial.run(can_scene, moved(good, [0.0, 0.0, -float(low) - 0.05]), hand)
+    assert outcomes.collided.all()
+    assert not outcomes.success.any()
+    assert np.isnan(outcomes.lost_at).all()
+    assert np.isnan(outcomes.shift).all()
+
+
+def test_a_collision_between_waypoints_is_seen(good: Grasps, hand: Hand) -> None:
+    """The path is looked at in between, and the approach before the pre-grasp as well."""
+    grasp = good[:1]
+    assert not trial.touches_table(grasp, hand).any()
+    waypoints = grasp.waypoints.clone()
+    waypoints[:, 3, 2] -= 0.3
+    assert trial.touches_table(Grasps(waypoints, "world"), hand).all()
+
+
+def test_the_squeeze_may_press_on_the_table_but_the_grip_may_not(good: Grasps, hand: Hand) -> None:
+    waypoints = good[:1].waypoints.clone()
+    waypoints[:, 8:, 2] -= 0.3
+    assert not trial.touches_table(Grasps(waypoints, "world"), hand).any()
+    waypoints[:, 6, 2] -= 0.3
+    assert trial.touches_table(Grasps(waypoints, "world"), hand).all()
+
+
+def test_a_fall_at_the_end_is_no_success(
+    can_scene: Scene, good: Grasps, hand: Hand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The hand opens a moment before the end: the object is not yet far, but it falls."""
+    commands = trial.trajectory
+
+    def opening(grasps: Grasps, hand: Hand) -> tuple[Any, Any, Any]:
+        wrist, turn, angles = commands(grasps, hand)
+        angles[:, -50:] = 0.0
+        return wrist, turn, angles
+
+    monkeypatch.setattr(trial, "trajectory", opening)
+    outcomes = trial.run(can_scene, good[:4], hand)
+    assert not outcomes.success.any()
+    assert (outcomes.lost_at > trial.LIFT + trial.HOLD - 0.5).all()
+
+
+def test_a_slippery_object_is_not_held(can_scene: Scene, good: Grasps, hand: Hand) -> None:
+    slippery = replace(can_scene, object=replace(can_scene.object, friction=0.03))
+    assert trial.run(can_scene, good, hand).success.all()
+    assert trial.run(slippery, good, hand).success.mean() < 0.2
+
+
+def test_a_diverged_simulation_is_unstable_and_no_success(
+    can_scene: Scene, good: Grasps, hand: Hand, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings in the working folder
+    advance = trial._Execution.advance
+
+    def shaken(self: trial._Execution, ids: np.ndarray, begin: int, end: int) -> None:
+        if begin == 0:
+            self.qpos[0, self.object_at] = np.nan  # a bad state
+            self.qvel[1, self.object_dof] = 1e12  # one that MuJoCo resets with a warning
+        advance(self, ids, begin, end)
+
+    monkeypatch.setattr(trial._Execution, "advance", shaken)
+    outcomes = trial.run(can_scene, good[:4], hand)
+    assert outcomes.unstable.tolist() == [True, True, False, False]
+    assert outcomes.success.tolist() == [False, False, True, True]
+    assert np.isnan(outcomes.shift[:2]).all()
+
+
+# the same however it is run
+
+
+@pytest.mark.parametrize(("num_threads", "batch"), [(1, 256), (2, 256), (2, 5)])
+def test_outcomes_depend_neither_on_threads_nor_on_batches(
+    can_scene: Scene,
+    world_grasps: Grasps,
+    can_outcomes: Outcomes,
+    some: np.ndarray,
+    hand: Hand,
+    num_threads: int,
+    batch: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(trial, "_BATCH", batch)
+    outcomes = trial.run(can_scene, world_grasps[some], hand, num_threads)
+    expected = Outcomes(*(getattr(can_outcomes, field.name)[some] for field in fields(Outcomes)))
+    assert_equal(outcomes, expected)
+
+
+def test_both_frames_give_the_same_verdict(
+    can_scene: Scene, world_grasps: Grasps, can_outcomes: Outcomes, some: np.ndarray
+) -> None:
+    np.testing.assert_array_equal(verify(world_grasps[some], can_scene).success, can_outcomes.success[some])
+
+
+def test_no_grasps_give_no_outcomes(can_scene: Scene, hand: Hand) -> None:
+    none = Grasps(torch.zeros(0, 10, 28), "world")
+    for outcomes in (trial.run(can_scene, none, hand), verify(none, can_scene), verify(none, can_scene, trials=2)):
+        assert len(outcomes) == 0
+        assert all(getattr(outcomes, field.name).shape == (0,) for field in fields(Outcomes))
+
+
+def test_repeated_trials_tell_a_rate_that_the_seed_repeats(
+    can_scene: Scene, world_grasps: Grasps, some: np.ndarray
+) -> None:
+    first = verify(world_grasps[some], can_scene, seed=4, trials=3)
+    np.testing.assert_allclose(first.success_rate * 3, np.round(first.success_rate * 3), atol=1e-6)
+    assert len(np.unique(first.success_rate)) > 1
+    assert_equal(verify(world_grasps[some], can_scene, seed=4, trials=3), first)
+    assert can_scene.object.friction == pytest.approx(0.523, abs=1e-3), "the scene stays as it was"
+
+
+# wrong calls
+
+
+def test_wrong_calls_are_explained(can_scene: Scene, can_grasps: Grasps, good: Grasps) -> None:
+    with pytest.raises(ValueError, match="trials is 0, expected at least 1"):
+        verify(good, can_scene, trials=0)
+    with pytest.raises(ValueError, match="are in the camera frame, but the scene has not been observed; use to_frame"):
+        verify(can_grasps, replace(can_scene, T_world_camera=None))
+    waypoints = good.waypoints.clone()
+    waypoints[0, 9, 8] = 3.0
+    with pytest.raises(ValueError, match=r"joint thumb_mcp is at 3\.000 rad, outside its limits"):
+        verify(Grasps(waypoints, "world"), can_scene)
