@@ -5,6 +5,8 @@ Its tables (`HandSpec`) feed the simulator too, so the two cannot drift apart.
 
 from __future__ import annotations
 
+import difflib
+import itertools
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dexzoo.geometry import SegmentPairs, box_distance, capsule_distance
 from dexzoo.hand_spec import HandSpec, Inertia, Joint, Pad, Primitive, Side
 from dexzoo.kinematics import KinematicTree, LinkPoses
 
@@ -36,7 +39,8 @@ class Hand(nn.Module):
 
     joint_names: the 20 joints in posture order; freedoms: the 15 that move by themselves.
     link_names: the links in the order of `forward_kinematics`; solid_names: those with a shape, in the order of
-    `signed_distance`; shapes: the primitives in the order of `shape_poses`.
+    `signed_distance`; shapes: the primitives in the order of `shape_poses`; self_pairs: the pairs of solid links in the
+    order of `self_distance`; pad_names: the fingers in the order of `pads`.
     """
 
     lower: Tensor
@@ -48,6 +52,7 @@ class Hand(nn.Module):
         self.joint_names = list(spec.joint_names)
         self.link_names = list(spec.link_names)
         self.freedoms = list(spec.freedoms)
+        self.pad_names = list(spec.pads)
         self.free_index = [self.joint_names.index(name) for name in self.freedoms]
         joints = [spec.joint(name) for name in spec.joint_names]
         self.register_buffer("lower", torch.tensor([joint.lower for joint in joints], dtype=torch.float32))
@@ -80,6 +85,16 @@ class Hand(nn.Module):
         self._shape_pose = torch.tensor(np.stack([shape.pose for shape in shapes]))
         self._shape_half = torch.tensor(np.stack([shape.half for shape in shapes]))
         self._shape_radius = torch.tensor([shape.radius for shape in shapes], dtype=torch.float64)
+        joined = {frozenset((joint.parent, joint.child)) for joint in self.spec.joints}
+        ignored = joined | {frozenset(pair) for pair in self.spec.exclude}
+        meeting = [
+            p
+            for p in itertools.combinations(range(len(self.solid_names)), 2)
+            if frozenset(self.solid_names[i] for i in p) not in ignored
+        ]
+        self.self_pairs = [(self.solid_names[i], self.solid_names[j]) for i, j in meeting]
+        groups = [(self._shape_groups[i], self._shape_groups[j]) for i, j in meeting]
+        self._pairs = SegmentPairs.between(shapes, groups)
 
     def _cast(self, like: Tensor) -> _Constants:
         """Every constant in the dtype and on the device of a tensor, kept for the next call."""
@@ -101,6 +116,46 @@ class Hand(nn.Module):
     def reduce(self, q20: Float[Tensor, "*batch joint"]) -> Float[Tensor, "*batch freedom"]:
         """The free joints among all; the inverse of `expand` on postures that keep the coupling."""
         return q20[..., self.free_index]
+
+    def clamp(self, q: Float[Tensor, "*batch joint"]) -> Float[Tensor, "*batch joint"]:
+        """The nearest angles within the limits; of all joints or of the free ones, by their number."""
+        lower, upper = self._limits(q)
+        return torch.minimum(torch.maximum(q, lower), upper)
+
+    def reflect(self, q: Float[Tensor, "*batch joint"]) -> Float[Tensor, "*batch joint"]:
+        """Angles beyond a limit mirrored back inside, as a random walk needs; of all joints or of the free ones."""
+        lower, upper = self._limits(q)
+        width = upper - lower
+        phase = torch.remainder(q - lower, 2 * width)
+        return lower + torch.minimum(phase, 2 * width - phase)
+
+    def squash(self, z: Float[Tensor, "*batch joint"]) -> Float[Tensor, "*batch joint"]:
+        """Real numbers smoothly to angles within the limits (middle at 0); of all joints or of the free ones."""
+        lower, upper = self._limits(z)
+        return lower + (upper - lower) * torch.sigmoid(z)
+
+    def random(self, num: int, generator: torch.Generator) -> Float[Tensor, "num joint"]:
+        """Postures drawn evenly within the limits, coupled, among those that do not touch themselves.
+
+        Raises RuntimeError when fewer than one in a hundred is free.
+        """
+        lower, upper = self.reduce(self.lower), self.reduce(self.upper)
+        found = torch.zeros(0, len(self.joint_names))
+        for _ in range(100):
+            if len(found) >= num:
+                break
+            q = self.expand(lower + (upper - lower) * torch.rand(max(num, 16), len(self.freedoms), generator=generator))
+            found = torch.cat((found, q[(self.self_distance(self.forward_kinematics(q)) > 0).all(-1)]))
+        if len(found) < num:
+            raise RuntimeError(f"hand {self.spec.name} touches itself in almost every posture; check its primitives")
+        return found[:num]
+
+    def _limits(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        lower, upper = self.lower.to(q), self.upper.to(q)
+        if q.shape[-1] == len(self.freedoms) != len(self.joint_names):
+            return self.reduce(lower), self.reduce(upper)
+        self._check_size(q)
+        return lower, upper
 
     def check(self, q20: Float[Tensor, "*batch joint"], tolerance: float = 1e-3) -> None:
         """Raise ValueError that names the joint, its value and its limits when a posture cannot be."""
@@ -127,6 +182,40 @@ class Hand(nn.Module):
         poses: Tensor = LinkPoses.apply(q20.reshape(-1, q20.shape[-1]), self._cast(q20).tree)
         return poses.reshape(*q20.shape[:-1], len(self.link_names), 4, 4)
 
+    def jacobian(
+        self, q20: Float[Tensor, "*batch joint"], link: str, point: Float[Tensor, 3] | None = None
+    ) -> Float[Tensor, "*batch 6 joint"]:
+        """Velocity of a point of a link by joint velocities, palm frame: linear (rows 0:3), angular (rows 3:6).
+
+        point: in the frame of the link; its origin if not given. Raises ValueError for an unknown link.
+        """
+        poses = self.forward_kinematics(q20)
+        pose = poses[..., self.link_index(link), :, :]
+        at = pose[..., :3, 3] if point is None else (pose[..., :3, :3] @ point.to(q20)) + pose[..., :3, 3]
+        tree = self._cast(q20).tree
+        frames = poses[..., tree.joint_links, :, :]
+        axes = (frames[..., :3, :3] @ tree.axes.permute(1, 0, 2)).squeeze(-1)  # (*batch, joint, 3)
+        axes = axes * tree.behind[:, self.link_index(link), None]
+        linear = torch.cross(axes, at[..., None, :] - frames[..., :3, 3], dim=-1)
+        return torch.cat((linear, axes), dim=-1).mT
+
+    def link_index(self, name: str) -> int:
+        """Place of a link in `link_names`; ValueError names the nearest for one that does not exist."""
+        if name not in self.link_names:
+            near = difflib.get_close_matches(name, self.link_names, 1)
+            raise ValueError(
+                f"hand {self.spec.name} has no link {name!r}" + (f", did you mean {near[0]}?" if near else "")
+            )
+        return self.link_names.index(name)
+
+    def pads(self, links: Float[Tensor, "*batch link 4 4"]) -> tuple[Tensor, Tensor]:
+        """Where the fingertips touch: points and outward normals, each (*batch, pad, 3), in the order of `pad_names`."""
+        poses = links[..., [self.link_index(self.spec.pads[name].link) for name in self.pad_names], :, :]
+        point = torch.tensor(np.stack([self.spec.pads[name].point for name in self.pad_names])).to(links)
+        normal = torch.tensor(np.stack([self.spec.pads[name].normal for name in self.pad_names])).to(links)
+        turn = poses[..., :3, :3]
+        return (turn @ point[..., None]).squeeze(-1) + poses[..., :3, 3], (turn @ normal[..., None]).squeeze(-1)
+
     def shape_poses(self, links: Float[Tensor, "*batch link 4 4"]) -> Float[Tensor, "*batch shape 4 4"]:
         """Poses of the primitives, given those of the links."""
         return links[..., self._shape_link, :, :] @ self._cast(links).shape_pose
@@ -145,9 +234,9 @@ class Hand(nn.Module):
         local = inverse @ points.mT[..., None, :, :] if points.ndim > 2 else inverse @ points.mT
         local = local - inverse @ poses[..., :3, 3:]  # (*both, shape, 3, point): rows, so that each is one stretch
         distance = [
-            _capsule_distance(local[..., i, :, :], half[i, 0], radius[i])
+            capsule_distance(local[..., i, :, :], half[i, 0], radius[i])
             if shape.is_capsule
-            else _box_distance(local[..., i, :, :], half[i], radius[i])
+            else box_distance(local[..., i, :, :], half[i], radius[i])
             for i, shape in enumerate(self.shapes)
         ]
         nearest = [
@@ -155,6 +244,16 @@ class Hand(nn.Module):
             for group in self._shape_groups
         ]
         return torch.stack(nearest, dim=-2)
+
+    def self_distance(self, links: Float[Tensor, "*batch link 4 4"]) -> Float[Tensor, "*batch pair"]:
+        """Distance in metres between the links of each of `self_pairs`, negative where they overlap.
+
+        The pairs are all solid links that neither share a joint nor are excluded in hand.yaml, as in the simulator.
+        Overlap is measured by the deepest point of one link's core (a capsule's axis, a box's edge) in the other.
+        """
+        constants = self._cast(links)
+        poses = self.shape_poses(links)
+        return self._pairs.distance(poses, constants.shape_half, constants.shape_radius, len(self.self_pairs))
 
     def clearance(
         self, links: Float[Tensor, "*batch link 4 4"], plane: Float[Tensor, "*plane 4"]
@@ -170,23 +269,6 @@ class Hand(nn.Module):
         reach = ((normal[..., None, :] @ poses[..., :3, :3]).squeeze(-2).abs() * half).sum(-1) + radius
         low = height - reach
         return torch.stack([low[..., group].amin(-1) for group in self._shape_groups], dim=-1)
-
-
-def _capsule_distance(local: Tensor, half: Tensor, radius: Tensor) -> Tensor:
-    """Distances of points (..., 3, point) to a capsule of half length `half` along x."""
-    x, y, z = local.unbind(-2)
-    beyond = (x.abs() - half).clamp_min(0)
-    square = beyond * beyond + y * y + z * z
-    return square.clamp_min(1e-16).sqrt() - radius  # the root has no gradient at zero
-
-
-def _box_distance(local: Tensor, half: Tensor, radius: Tensor) -> Tensor:
-    """Distances of points (..., 3, point) to a box of half sizes `half` rounded by `radius`."""
-    outside = local.abs() - half[:, None]
-    square = outside.clamp_min(0).square().sum(-2)
-    positive = square > 0
-    distance = torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
-    return distance + outside.amax(-2).clamp_max(0) - radius
 
 
 @lru_cache(maxsize=4)

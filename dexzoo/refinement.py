@@ -162,8 +162,7 @@ def move(waypoints: Tensor, wrist: Float[Tensor, "grasp 6"], freedoms: Float[Ten
     carried = transform_waypoints(T @ step @ torch.linalg.inv(T), waypoints)
     share = torch.linspace(0, NUM_WAYPOINTS - 1, NUM_WAYPOINTS).div(GRIP).clamp_max(1)
     free = hand.reduce(waypoints[..., JOINTS]) + share[:, None] * freedoms[:, None]
-    lower, upper = hand.reduce(hand.lower), hand.reduce(hand.upper)
-    joints = hand.expand(torch.minimum(torch.maximum(free, lower), upper))
+    joints = hand.expand(hand.clamp(free))
     return torch.cat((carried[..., :7], joints, waypoints[..., 27:]), dim=-1)
 
 
@@ -231,7 +230,7 @@ def _ascend_waypoints(
         waypoints = waypoints + learning_rate * mask * gradient.nan_to_num(0.0, 0.0, 0.0)
         position = start[..., POSITION] + (waypoints[..., POSITION] - start[..., POSITION]).clamp(-CUBE, CUBE)
         quaternion = rotation.normalize(waypoints[..., QUATERNION])
-        joints = torch.minimum(torch.maximum(waypoints[..., JOINTS], hand.lower), hand.upper)
+        joints = hand.clamp(waypoints[..., JOINTS])
         waypoints = torch.cat((position, quaternion, joints, start[..., 27:]), dim=-1)
         if on_step is not None:
             on_step(step, logit.detach())

@@ -16,7 +16,7 @@ LAYERS = [
     {"rotation", "resources"},
     {"grasp", "camera"},
     {"hand_spec"},
-    {"kinematics"},
+    {"kinematics", "geometry"},
     {"hand"},
     {"metrics", "sim", "generators"},
     {"models"},

@@ -128,8 +128,7 @@ def perturb(index: np.ndarray, grasps: Grasps, hand: Hand, rng: np.random.Genera
     change = size(0.03, 0.15) * torch.tensor(rng.uniform(-1, 1, (n, 15)), dtype=torch.float32)
     joints = key[..., 7:].clone()
     joints[:, 1:] += change[:, None]
-    lower, upper = hand.reduce(hand.lower), hand.reduce(hand.upper)
-    joints = torch.minimum(torch.maximum(joints, lower), upper)
+    joints = hand.clamp(joints)
     return decode_path(torch.cat((position, quaternion, joints), -1).flatten(1), near.grasp_type, hand)
 
 

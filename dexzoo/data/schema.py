@@ -134,12 +134,25 @@ def merge(folder: Path, out: Path) -> None:
     scenes = sorted(folder.glob("scene_*"))
     if not scenes:
         raise ValueError(f"{folder} holds no scene; run collect first")
+    tables = {name: pa.concat_tables([_read(scene, name) for scene in scenes]) for name in TABLES}
     out.mkdir(parents=True, exist_ok=True)
-    for name in TABLES:
-        table = pa.concat_tables([pq.read_table(scene / f"{name}.parquet") for scene in scenes])
+    for name, table in tables.items():
         temporary = out / f".{name}.parquet"
         pq.write_table(table, temporary, compression="zstd", use_byte_stream_split=False)
         temporary.rename(out / f"{name}.parquet")
+
+
+def _read(folder: Path, name: str) -> pa.Table:
+    path = folder / f"{name}.parquet"
+    if not path.is_file():
+        raise FileNotFoundError(f"grasp set {folder} has no {name}.parquet")
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise ValueError(f"{path} cannot be read as Parquet: {error}") from None
+    if table.schema.names != SCHEMAS[name].names:
+        raise ValueError(f"{path} has the columns {', '.join(table.schema.names)}; expected version {VERSION}'s")
+    return table
 
 
 class GraspSet:
@@ -154,7 +167,7 @@ class GraspSet:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self.scenes, self.views, self.grasps = (self._read(name) for name in TABLES)
+        self.scenes, self.views, self.grasps = (_read(self.folder, name) for name in TABLES)
         scene_row = {scene: row for row, scene in enumerate(self.scenes["scene"].to_pylist())}
         view_row = {
             key: row
@@ -168,23 +181,16 @@ class GraspSet:
             raise ValueError(
                 f"{self.folder / 'grasps.parquet'} names scene or view {error}, which is not there"
             ) from None
-        split = np.array([SPLITS.index(name) for name in self.scenes["split"].to_pylist()], np.int64)
+        names = self.scenes["split"].to_pylist()
+        if strange := set(names) - set(SPLITS):
+            raise ValueError(
+                f"{self.folder / 'scenes.parquet'} has the split {strange.pop()!r}; use {', '.join(SPLITS)}"
+            )
+        split = np.array([SPLITS.index(name) for name in names], np.int64)
         self.grasp_split = split[self.grasp_scene]
         self.view_split = split[[scene_row[scene] for scene in self.views["scene"].to_pylist()]]
         self.success = self.grasps["success"].to_numpy(zero_copy_only=False)
         self.source = np.array(self.grasps["source"].to_pylist())
-
-    def _read(self, name: str) -> pa.Table:
-        path = self.folder / f"{name}.parquet"
-        if not path.is_file():
-            raise FileNotFoundError(f"grasp set {self.folder} has no {name}.parquet")
-        try:
-            table = pq.read_table(path)
-        except (pa.ArrowInvalid, OSError) as error:
-            raise ValueError(f"{path} cannot be read as Parquet: {error}") from None
-        if table.schema.names != SCHEMAS[name].names:
-            raise ValueError(f"{path} has the columns {', '.join(table.schema.names)}; expected version {VERSION}'s")
-        return table
 
     @cached_property
     def world_grasps(self) -> Grasps:

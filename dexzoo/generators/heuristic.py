@@ -239,8 +239,7 @@ class HeuristicGenerator(GraspGenerator):
         finger = [("thumb", "index", "middle", "ring", "little").index(name.split("_")[0]) for name in hand.freedoms]
         flexes = torch.tensor([not name.endswith("_abd") for name in hand.freedoms])
         press = SQUEEZE * (contact[:, finger] & flexes)
-        lower, upper = hand.reduce(hand.lower), hand.reduce(hand.upper)
-        squeeze = torch.minimum(torch.maximum(grip + press, lower), upper)
+        squeeze = hand.clamp(grip + press)
         joints = hand.expand(torch.stack((opened, grip, squeeze), 1))
         types = torch.tensor([p.grasp_type for p in _PRESHAPES])[preshape]
         return Grasps.from_keyframes(position, quaternion[:, None].expand(-1, 3, -1), joints, types, "world")

@@ -93,8 +93,7 @@ def trajectory(grasps: Grasps, hand: Hand) -> tuple[NDArray[np.float64], NDArray
     wrist, turn, angles = _interpolate(position, quaternion, joints, keys)
     rise = np.clip((steps - times[-1] - PAUSE) / LIFT, 0, 1)
     wrist[..., 2] += torch.tensor(LIFT_HEIGHT * rise**2 * (3 - 2 * rise))
-    limited = torch.minimum(torch.maximum(angles, hand.lower.double()), hand.upper.double())
-    return wrist.numpy(), turn.numpy(), limited.numpy()
+    return wrist.numpy(), turn.numpy(), hand.clamp(angles).numpy()
 
 
 def lift_start() -> int:
