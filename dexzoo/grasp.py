@@ -216,6 +216,17 @@ def pose_matrix(
     return torch.cat((top, bottom), dim=-2)
 
 
+def step_pose(
+    pose: Float[Tensor, "*batch 4 4"], tangent: Float[Tensor, "*batch 6"], box: Float[Tensor, 6] | None = None
+) -> Float[Tensor, "*batch 4 4"]:
+    """Poses moved in the tangent space of SE(3): a translation (m) and a rotation vector (rad), in their own frame.
+
+    box: half sizes of the box that the step stays in, smoothly: a step of t is box * tanh(t / box).
+    """
+    step = tangent if box is None else box * torch.tanh(tangent / box)
+    return pose @ pose_matrix(step[..., :3], rotation.exp(step[..., 3:]))
+
+
 def transform_waypoints(
     T_a_b: Float[Tensor, "*pose 4 4"], waypoints: Float[Tensor, "*batch 10 28"]
 ) -> Float[Tensor, "*batch 10 28"]:

@@ -183,7 +183,7 @@ class Hand(nn.Module):
         return poses.reshape(*q20.shape[:-1], len(self.link_names), 4, 4)
 
     def jacobian(
-        self, q20: Float[Tensor, "*batch joint"], link: str, point: Float[Tensor, 3] | None = None
+        self, q20: Float[Tensor, "*batch joint"], link: str, point: Float[Tensor, " 3"] | None = None
     ) -> Float[Tensor, "*batch 6 joint"]:
         """Velocity of a point of a link by joint velocities, palm frame: linear (rows 0:3), angular (rows 3:6).
 
@@ -209,7 +209,7 @@ class Hand(nn.Module):
         return self.link_names.index(name)
 
     def pads(self, links: Float[Tensor, "*batch link 4 4"]) -> tuple[Tensor, Tensor]:
-        """Where the fingertips touch: points and outward normals, each (*batch, pad, 3), in the order of `pad_names`."""
+        """Where the fingertips touch: points and outward normals, each (*batch, pad, 3), in the order `pad_names`."""
         poses = links[..., [self.link_index(self.spec.pads[name].link) for name in self.pad_names], :, :]
         point = torch.tensor(np.stack([self.spec.pads[name].point for name in self.pad_names])).to(links)
         normal = torch.tensor(np.stack([self.spec.pads[name].normal for name in self.pad_names])).to(links)

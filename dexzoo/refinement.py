@@ -21,7 +21,17 @@ from torch import Tensor
 
 from dexzoo import rotation
 from dexzoo.camera import Camera, Observation
-from dexzoo.grasp import GRIP, JOINTS, NUM_WAYPOINTS, POSITION, QUATERNION, Grasps, pose_matrix, transform_waypoints
+from dexzoo.grasp import (
+    GRIP,
+    JOINTS,
+    NUM_WAYPOINTS,
+    POSITION,
+    QUATERNION,
+    Grasps,
+    pose_matrix,
+    step_pose,
+    transform_waypoints,
+)
 from dexzoo.hand import Hand, default_hand
 from dexzoo.models.evaluator import GraspEvaluator, PreparedView
 from dexzoo.models.zoo import load
@@ -158,8 +168,7 @@ def move(waypoints: Tensor, wrist: Float[Tensor, "grasp 6"], freedoms: Float[Ten
     the grip, the same from there to the squeeze. Joints stay within their limits.
     """
     T = pose_matrix(waypoints[:, GRIP, POSITION], waypoints[:, GRIP, QUATERNION])
-    step = pose_matrix(wrist[:, :3], rotation.exp(wrist[:, 3:]))
-    carried = transform_waypoints(T @ step @ torch.linalg.inv(T), waypoints)
+    carried = transform_waypoints(step_pose(T, wrist) @ torch.linalg.inv(T), waypoints)
     share = torch.linspace(0, NUM_WAYPOINTS - 1, NUM_WAYPOINTS).div(GRIP).clamp_max(1)
     free = hand.reduce(waypoints[..., JOINTS]) + share[:, None] * freedoms[:, None]
     joints = hand.expand(hand.clamp(free))

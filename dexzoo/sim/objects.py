@@ -11,6 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 MIN_EXTENT, MAX_EXTENT = 5e-4, 1.0
+MIN_SLIVER = 2e-4
 MAX_FRICTION = 2.0
 Mesh = trimesh.Trimesh
 
@@ -48,12 +49,17 @@ class ObjectModel:
         """An object from a mesh file in metres (any format trimesh reads), or from a mesh.
 
         hulls: its convex parts, as files or meshes; None has them computed by CoACD (Wei et al. 2022), which takes
-        seconds to a minute. name: by default that of the file, or of its folder where the file is called mesh.
+        seconds to a minute. Parts thinner than 0.2 mm, as decompositions leave them, are dropped.
+        name: by default that of the file, or of its folder where the file is called mesh.
         Raises FileNotFoundError or ValueError for a mesh that is missing, empty, flat, not finite or not in metres.
         """
         label = name or ("object" if isinstance(mesh, Mesh) else _name(Path(mesh)))
         surface = _read(mesh, label)
+        if surface.extents.min() < MIN_EXTENT:
+            thin = f"{surface.extents.min() * 1000:.2f} mm thick, expected at least {MIN_EXTENT * 1000:g} mm"
+            raise ValueError(f"mesh {label if isinstance(mesh, Mesh) else mesh} is flat: {thin}")
         parts = _decompose(surface) if hulls is None else [_read(hull, f"hull of {label}") for hull in hulls]
+        parts = [part for part in parts if part.extents.min() >= MIN_SLIVER]
         if not parts:
             raise ValueError(f"object {label} has no convex parts; give hulls=None to have them computed")
         return cls(label, surface, tuple(part.convex_hull for part in parts), float(mass), float(friction))
@@ -115,10 +121,6 @@ def _check(mesh: Mesh, where: str) -> None:
     extent = mesh.extents
     if extent.max() > MAX_EXTENT:
         raise ValueError(f"mesh {where} is {extent.max():.1f} m large and looks like millimetres; divide it by 1000")
-    if extent.min() < MIN_EXTENT:
-        raise ValueError(
-            f"mesh {where} is flat: {extent.min() * 1000:.2f} mm thick, expected at least {MIN_EXTENT * 1000:g} mm"
-        )
 
 
 def _decompose(mesh: Mesh) -> list[Mesh]:
