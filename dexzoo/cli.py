@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import difflib
 import json
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jsonargparse import ArgumentParser, Namespace
+from jsonargparse import ArgumentError, ArgumentParser, Namespace
+from jsonargparse.typing import NonNegativeInt, PositiveInt
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -24,7 +27,7 @@ from dexzoo.models.zoo import list_models, model_class, shipped_card
 from dexzoo.planning import Plan, plan
 from dexzoo.refinement import refine
 from dexzoo.sim import ObjectModel, Scene
-from dexzoo.sim.shapes import make_object, object_names
+from dexzoo.sim.shapes import make_object
 from dexzoo.verification import verify
 
 TRAINING = ("fit", "validate", "test", "predict")
@@ -39,17 +42,24 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     args = list(sys.argv[1:] if args is None else args)
     try:
+        _check_command(args)
         if args and args[0] in TRAINING:
             training.main(args)
             return OK
-        parser = _parser()
-        config = parser.parse_args(args or ["--help"])
+        config = _parser().parse_args(args or ["--help"])
         options: Namespace = config[config.subcommand]
         result, table = _COMMANDS[config.subcommand](options)
         if options.json:
             sys.stdout.write(json.dumps(result, indent=2) + "\n")
         elif table is not None:
             _out.print(table)
+    except SystemExit as end:  # --help
+        return OK if end.code in (0, None) else WRONG_CALL
+    except ArgumentError as error:
+        # its names of options are those of a configuration file
+        message = re.sub(rf'Parser key "(\w+)"|\b(?:{"|".join(_COMMANDS)})\.(\w+)', r"--\1\2", str(error))
+        command = args[0] if args[0] in _COMMANDS else "COMMAND"
+        return _complain(f"{message}; see python -m dexzoo {command} --help", WRONG_CALL)
     except (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
         return _complain(error, WRONG_CALL)
     except (RuntimeError, OSError) as error:
@@ -59,6 +69,14 @@ def main(args: Sequence[str] | None = None) -> int:
     return OK
 
 
+def _check_command(args: Sequence[str]) -> None:
+    known = (*TRAINING, *_COMMANDS)
+    if args and not args[0].startswith("-") and args[0] not in known:
+        near = difflib.get_close_matches(args[0], known, 1)
+        hint = f", did you mean {near[0]}?" if near else ";"
+        raise ValueError(f"command {args[0]!r} is unknown{hint} use one of {', '.join(known)}")
+
+
 def _complain(error: Exception | str, status: int) -> int:
     message = " ".join(str(error).split())
     sys.stderr.write(f"dexzoo: {message}\n")
@@ -66,16 +84,18 @@ def _complain(error: Exception | str, status: int) -> int:
 
 
 def _parser() -> ArgumentParser:
+    # errors are raised, not printed with a page of usage
     parser = ArgumentParser(
         prog="python -m dexzoo",
+        exit_on_error=False,
         description="Grasps for a five-finger hand from one depth image. "
         f"Training: {', '.join(TRAINING)} (each with --config FILE and --help of its own).",
     )
     commands = parser.add_subcommands(dest="subcommand", required=True)
 
     def add(name: str, text: str) -> ArgumentParser:
-        command = ArgumentParser(description=text)
-        command.add_argument("--seed", type=int, default=0, help="the same seed gives the same result")
+        command = ArgumentParser(description=text, exit_on_error=False)
+        command.add_argument("--seed", type=NonNegativeInt, default=0, help="the same seed gives the same result")
         command.add_argument("--json", action="store_true", help="print JSON for machines")
         commands.add_subcommand(name, command, help=text)
         return command
@@ -89,7 +109,7 @@ def _parser() -> ArgumentParser:
 
     command = add("plan", "Propose and rank grasps for one depth image.")
     add_observation(command)
-    command.add_argument("--num_grasps", type=int, default=100, help="candidates to generate")
+    command.add_argument("--num_grasps", type=PositiveInt, default=100, help="candidates to generate")
     command.add_argument("--refine", action="store_true", help="refine the twenty best")
     command.add_argument("--out", type=Path, help="folder for grasps.safetensors, plan.json and pictures")
 
@@ -97,7 +117,7 @@ def _parser() -> ArgumentParser:
     add_observation(command)
     command.add_argument("--grasps", type=Path, required=True, help="file of grasps, from plan --out")
     command.add_argument("--variables", default="grip", choices=["grip", "waypoints", "last3"], help="what is moved")
-    command.add_argument("--num_steps", type=int, default=20, help="steps of the ascent")
+    command.add_argument("--num_steps", type=NonNegativeInt, default=20, help="steps of the ascent")
     command.add_argument("--out", type=Path, help="file for the refined grasps (.safetensors)")
 
     command = add("verify", "Execute grasps on an object in simulation: close, lift 1 m, hold 2 s.")
@@ -106,32 +126,34 @@ def _parser() -> ArgumentParser:
     command.add_argument("--mass", type=float, help="kg (default 0.2, or the named object's)")
     command.add_argument("--friction", type=float, help="sliding friction (default 0.7, or the named object's)")
     command.add_argument("--grasps", type=Path, help="file of grasps in the world frame; otherwise they are generated")
-    command.add_argument("--num_grasps", type=int, default=50, help="candidates to generate from one view")
+    command.add_argument("--num_grasps", type=PositiveInt, default=50, help="candidates to generate from one view")
     command.add_argument("--evaluator", default="em2", help="name or path of the model that ranks them")
-    command.add_argument("--trials", type=int, default=1, help="repetitions under drawn mass, friction and wrist error")
+    command.add_argument(
+        "--trials", type=PositiveInt, default=1, help="repetitions under drawn mass, friction and wrist error"
+    )
 
     command = add("collect", "Make a grasp set: scenes, views, grasps and their outcomes. Goes on where it stopped.")
     command.add_argument("--out", type=Path, required=True, help="folder of the grasp set")
-    command.add_argument("--scenes", type=int, default=100, help="how many scenes")
-    command.add_argument("--workers", type=int, default=1, help="processes")
+    command.add_argument("--scenes", type=PositiveInt, default=100, help="how many scenes")
+    command.add_argument("--workers", type=PositiveInt, default=1, help="processes")
 
     add("models", "List the evaluative models.")
     return parser
 
 
 def _plan(options: Namespace) -> Result:
-    if options.num_grasps < 1:
-        raise ValueError(f"--num_grasps is {options.num_grasps}, expected at least 1")
+    _check_folder(options.out)
     observation = Observation.load(options.depth, options.camera)
     with _err.status("generating, scoring and refining grasps" if options.refine else "generating and scoring grasps"):
         result = plan(observation, options.evaluator, options.num_grasps, 20 if options.refine else 0, options.seed)
     rows = _plan_rows(result)
     if options.out is not None:
+        picture = best_grasp_picture(observation, result.grasps)
         options.out.mkdir(parents=True, exist_ok=True)
         result.grasps.save(options.out / "grasps.safetensors")
         summary = {"frame": "camera", "T_world_camera": observation.T_world_camera.tolist(), "grasps": rows}
         (options.out / "plan.json").write_text(json.dumps(summary, indent=2) + "\n")
-        plots.save(best_grasp_picture(observation, result.grasps), options.out / "best_grasp.png")
+        plots.save(picture, options.out / "best_grasp.png")
     table = Table(title=f"{len(rows)} grasps, the ten best by {options.evaluator}")
     for name in ("rank", "type", "generator's rank", "score", "refined"):
         table.add_column(name, justify="left" if name == "type" else "right")
@@ -140,6 +162,12 @@ def _plan(options: Namespace) -> Result:
             str(row["rank"]), row["type"], str(row["generator_rank"]), f"{row['score']:.3f}", f"{row['refined']:.3f}"
         )
     return {"grasps": rows}, table
+
+
+def _check_folder(out: Path | None) -> None:
+    """Before any work is done."""
+    if out is not None and out.exists() and not out.is_dir():
+        raise NotADirectoryError(f"--out {out} is a file; give a folder")
 
 
 def _plan_rows(result: Plan) -> list[dict[str, Any]]:
@@ -176,6 +204,8 @@ def best_grasp_picture(observation: Observation, grasps: Grasps) -> plots.Image:
 
 
 def _refine(options: Namespace) -> Result:
+    if options.out is not None and options.out.is_dir():
+        raise IsADirectoryError(f"--out {options.out} is a folder; give a file")
     observation = Observation.load(options.depth, options.camera)
     grasps = Grasps.load(options.grasps)
     with _err.status("refining"):
@@ -231,7 +261,7 @@ def _verify(options: Namespace) -> Result:
 
 
 def _object(options: Namespace) -> ObjectModel:
-    if options.object in object_names():
+    if not Path(options.object).exists() and not Path(options.object).suffix:
         named = make_object(options.object)
         mass = named.mass if options.mass is None else options.mass
         friction = named.friction if options.friction is None else options.friction
@@ -243,8 +273,7 @@ def _object(options: Namespace) -> ObjectModel:
 
 
 def _collect(options: Namespace) -> Result:
-    if options.scenes < 1 or options.workers < 1:
-        raise ValueError("--scenes and --workers must be at least 1")
+    _check_folder(options.out)
     scenes = options.out / "scenes"
     lines = collect(scenes, options.scenes, options.workers, options.seed)
     for _ in track(lines, "collecting scenes", options.scenes, console=_err, disable=not _err.is_terminal):

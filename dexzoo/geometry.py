@@ -1,39 +1,113 @@
 """Distances between rounded boxes, points and each other. A capsule is a rounded box with one half size alone.
 
-All are exact, differentiable, and batched over leading dimensions; lengths in metres.
+All are exact, batched, and differentiable once; lengths in metres. Coordinates come first, as planes (3, ...), so that
+what is done to them runs along memory.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from dexzoo.hand_spec import Primitive
 
-_SEARCH_STEPS = {torch.float32: 36, torch.float64: 64}
-_SHRINK = (5**0.5 - 1) / 2  # of the interval by each step of the golden section search
-
-
-def capsule_distance(local: Tensor, half: Tensor, radius: Tensor) -> Tensor:
-    """Signed distances of points (..., 3, point) to a capsule of half length `half` along x."""
-    x, y, z = local.unbind(-2)
-    beyond = (x.abs() - half).clamp_min(0)
-    square = torch.addcmul(torch.addcmul(z * z, y, y), beyond, beyond)
-    return square.clamp_min(1e-16).sqrt() - radius  # the root has no gradient at zero
+_CHUNK = 2**18  # coordinates handled at once, so that they stay in cache
+_HALVINGS = {torch.float32: 18, torch.float64: 42}
+"""Of a segment in search of its nearest point; with more, rounding would hide on which face either end lies."""
 
 
 def box_distance(local: Tensor, half: Tensor, radius: Tensor) -> Tensor:
-    """Signed distances of points (..., 3, point) to a box of half sizes `half` (..., 3) rounded by `radius`."""
-    outside = local.abs() - half[..., None]
-    square = outside.clamp_min(0).square().sum(-2)
+    """Signed distances of points (3, ...) to boxes of half sizes `half` (3, ...) rounded by `radius` (...)."""
+    outside = local.abs() - half
+    square = outside.clamp_min(0).square().sum(0)
     positive = square > 0  # the root has no gradient at zero
     distance = torch.where(positive, torch.where(positive, square, 1.0).sqrt(), 0.0)
-    return distance + outside.amax(-2).clamp_max(0) - radius
+    return distance + outside.amax(0).clamp_max(0) - radius
+
+
+def box_slope(local: Tensor, half: Tensor) -> Tensor:
+    """Gradient (3, ...) of `box_distance` by the points; that of one face where faces are equally near from inside."""
+    outside = local.abs() - half
+    slope = outside.clamp_min(0)
+    length = slope.square().sum(0).sqrt_()
+    inside = (length == 0).nonzero(as_tuple=True)
+    slope[(outside[(slice(None), *inside)].argmax(0), *inside)] = 1
+    length[inside] = 1
+    return slope.mul_(local.sign()).div_(length)
+
+
+class PointDistance(torch.autograd.Function):
+    """Signed distances (batch, group, point) of points to groups of rounded boxes; in each group the nearest counts.
+
+    transform: (batch, shape, 3, 4) from the frame of the points to that of each shape; points: (point, 3), or
+    (batch, point, 3); half: (shape, 3); radius: (shape,); groups: consecutive shapes.
+    Between points and result lie many times their size of coordinates. None are kept: the gradient computes them anew,
+    a few postures at a time.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,  # noqa: ANN401, torch's own type is untyped
+        transform: Tensor,
+        points: Tensor,
+        half: Tensor,
+        radius: Tensor,
+        groups: Sequence[slice],
+    ) -> Tensor:
+        """Distances; keeps the arguments."""
+        half, radius = half.T[:, None, :, None], radius[:, None]
+        ctx.save_for_backward(transform, points, half, radius)
+        ctx.groups = groups
+        nearest = transform.new_empty(len(transform), len(groups), points.shape[-2])
+        for part, rows, columns in _chunks(transform, points):
+            distance = box_distance(rows @ columns, half, radius)
+            for i, group in enumerate(groups):
+                nearest[part, i] = distance[:, group].amin(1)
+        return nearest
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:  # noqa: ANN401
+        """A transform's rows are pushed along the slope of its distance, weighed by the points."""
+        transform, points, half, radius = ctx.saved_tensors
+        by_transform = torch.empty_like(transform) if ctx.needs_input_grad[0] else None
+        by_points = torch.zeros_like(points) if ctx.needs_input_grad[1] else None
+        for part, rows, columns in _chunks(transform, points):
+            local = rows @ columns
+            share = torch.empty_like(local[0])
+            for i, group in enumerate(ctx.groups):
+                share[:, group] = gradient[part, i, None]
+                if group.stop - group.start > 1:
+                    distance = box_distance(local[:, :, group], half[:, :, group], radius[group])
+                    nearest = distance == distance.amin(1, keepdim=True)
+                    share[:, group] *= nearest / nearest.sum(1, keepdim=True)
+            push = box_slope(local, half).mul_(share)
+            if by_transform is not None:
+                by_transform[part] = (push @ columns.mT).movedim(0, -2)
+            if by_points is not None:
+                along = (rows[..., :3].mT @ push).sum(0).mT
+                if points.ndim == 2:
+                    by_points += along.sum(0)
+                else:
+                    by_points[part] = along
+        return by_transform, by_points, None, None, None
+
+
+def _chunks(transform: Tensor, points: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
+    """Parts of the batch: which, transforms as planes (3, part, shape, 4), homogeneous points ([part], 4, point)."""
+    planes = transform.movedim(-2, 0)
+    columns = torch.cat((points, torch.ones_like(points[..., :1])), -1).mT.contiguous()
+    size = max(1, _CHUNK // max(1, 3 * transform.shape[1] * points.shape[-2]))
+    for start in range(0, len(transform), size):
+        part = slice(start, start + size)
+        yield part, planes[:, part], columns if points.ndim == 2 else columns[part]
 
 
 @dataclass(frozen=True)
@@ -73,37 +147,51 @@ class SegmentPairs:
         )
 
     def distance(self, poses: Tensor, half: Tensor, radius: Tensor, num_pairs: int) -> Tensor:
-        """(*batch, pair) smallest distances, negative by how deep the deepest point of a segment's core lies.
+        """(batch, pair) smallest distances, negative by how deep the deepest point of a segment lies in the box.
 
-        poses: (*batch, shape, 4, 4); half: (shape, 3); radius: (shape,). The distance of a point that runs along a
-        segment to a convex body is convex, so a golden section search finds its minimum; the gradient is that of the
-        point found (envelope theorem).
+        poses: (batch, shape, 4, 4); half: (shape, 3); radius: (shape,). The distance of a point that runs along a
+        segment to a convex body is convex, so its slope is halved down to the minimum. From inside, the deepest point
+        is as near to one face as to another: the ends of what is left of the segment lie on either side, and the
+        gradient is that of both, in the shares with which their slopes along the segment cancel.
         """
-        turn, origin = poses[..., self.second, :3, :3], poses[..., self.second, :3, 3]
-        first = poses[..., self.first, :, :]
+        first, second = poses[:, self.first], poses[:, self.second]
+        turn = second[..., :3, :3]
+        offset = first[..., :3, 3] - second[..., :3, 3]
 
         def seen(point: Tensor) -> Tensor:
-            world = (first[..., :3, :3] @ point.to(poses)[..., None]).squeeze(-1) + first[..., :3, 3]
-            return ((world - origin)[..., None, :] @ turn).squeeze(-2)
+            relative = (first[..., :3, :3] @ point.to(poses)[..., None]).squeeze(-1) + offset
+            return (relative[..., None, :] @ turn).squeeze(-2).movedim(-1, 0)
 
         start, end = seen(self.start), seen(self.end)
-        box, gap = half[self.second], radius[self.first] + radius[self.second]
-
-        def along(t: Tensor) -> Tensor:
-            point = start + t[..., None] * (end - start)
-            return box_distance(point[..., None], box, gap[:, None]).squeeze(-1)
+        box = half[self.second].T[:, None]
 
         with torch.no_grad():
-            low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
-            for _ in range(_SEARCH_STEPS[poses.dtype]):
-                step = _SHRINK * (high - low)
-                left, right = high - step, low + step
-                falls = along(left) > along(right)
-                low, high = torch.where(falls, left, low), torch.where(falls, high, right)
-            t = (low + high) / 2
-        found = along(t)
-        far = found.new_full((*found.shape[:-1], num_pairs), torch.inf)
-        return far.scatter_reduce(-1, self.pair.expand_as(found), found, "amin")
+            along = end - start
+
+            def rise(t: Tensor) -> Tensor:
+                return _rise(start + t * along, along, box)
+
+            low, high = torch.zeros_like(start[0]), torch.ones_like(start[0])
+            for _ in range(_HALVINGS[poses.dtype]):
+                t = (low + high) / 2
+                rises = rise(t) > 0
+                low, high = torch.where(rises, low, t), torch.where(rises, t, high)
+            fall, climb = -rise(low), rise(high)
+            share = (fall / (fall + climb).clamp_min(torch.finfo(fall.dtype).tiny)).clamp(0, 1)
+        gap = radius[self.first] + radius[self.second]
+        before, after = (box_distance(torch.lerp(start, end, t), box, gap) for t in (low, high))
+        found = torch.lerp(before, after, share)
+        far = found.new_full((len(found), num_pairs), torch.inf)
+        return far.scatter_reduce(-1, self.pair.to(found.device).expand_as(found), found, "amin")
+
+
+def _rise(point: Tensor, along: Tensor, half: Tensor) -> Tensor:
+    """Slope of `box_distance` up to a positive factor, as points (3, ...) move along a direction (3, ...)."""
+    outside = point.abs() - half
+    away = point.sign() * along
+    deepest = outside.amax(0)
+    inside = torch.where(outside[0] == deepest, away[0], torch.where(outside[1] == deepest, away[1], away[2]))
+    return torch.where(deepest > 0, (outside.clamp_min(0) * away).sum(0), inside)
 
 
 def _segments(shape: Primitive) -> list[np.ndarray]:

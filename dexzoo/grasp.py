@@ -204,7 +204,10 @@ class Grasps:
         if frame not in ("world", "camera"):
             raise ValueError(f"{path} names no frame in its metadata; write it with Grasps.save")
         likelihood = tensors.get("log_likelihood")
-        return cls(tensors["waypoints"].float(), frame, None if likelihood is None else likelihood.float())
+        try:
+            return cls(tensors["waypoints"].float(), frame, None if likelihood is None else likelihood.float())
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
 
 def pose_matrix(

@@ -12,6 +12,7 @@ from typing import Any, Literal
 from xml.etree import ElementTree
 
 import numpy as np
+import trimesh
 import yaml
 import yourdfpy
 from numpy.typing import NDArray
@@ -38,6 +39,16 @@ class Primitive:
     def is_capsule(self) -> bool:
         """Whether it lies along x alone."""
         return bool(self.radius > 0 and not self.half[1:].any())
+
+    def mesh(self) -> trimesh.Trimesh:
+        """A mesh of it in its own frame, for pictures; a capsule is faceted and lies within its radius."""
+        mesh: trimesh.Trimesh
+        if self.is_capsule:
+            mesh = trimesh.creation.capsule(2 * self.half[0], self.radius, count=[12, 12])
+            mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+        else:
+            mesh = trimesh.creation.box(2 * self.half)
+        return mesh
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def hand_solid(hand: Hand, waypoint: torch.Tensor, colour: tuple[int, int, int] 
     waypoint = waypoint.detach().double()
     wrist = pose_matrix(waypoint[:3], waypoint[3:7])
     poses = (wrist @ hand.shape_poses(hand.forward_kinematics(waypoint[JOINTS]))).numpy()
-    meshes = [mesh.copy().apply_transform(T) for mesh, T in zip(_shapes(hand), poses, strict=True)]
+    meshes = [shape.mesh().apply_transform(T) for shape, T in zip(hand.shapes, poses, strict=True)]
     return Solid(_joined(meshes), colour)
 
 
@@ -43,18 +43,6 @@ def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     joined = trimesh.util.concatenate(meshes)
     assert isinstance(joined, trimesh.Trimesh)  # what meshes alone make
     return joined
-
-
-def _shapes(hand: Hand) -> list[trimesh.Trimesh]:
-    meshes = []
-    for primitive in hand.shapes:
-        if primitive.radius > 0:
-            capsule = trimesh.creation.capsule(2 * primitive.half[0], primitive.radius, count=[12, 12])
-            capsule.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
-            meshes.append(capsule)
-        else:
-            meshes.append(trimesh.creation.box(2 * primitive.half))
-    return meshes
 
 
 def render(

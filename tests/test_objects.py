@@ -105,6 +105,12 @@ def test_given_parts_are_taken_as_they_are(tmp_path: Path) -> None:
     assert [len(hull.vertices) for hull in model.hulls] == [8, 8]
 
 
+def test_slivers_among_the_parts_are_dropped() -> None:
+    model = ObjectModel.from_mesh(CUBE, hulls=[SLIVER, CUBE, SLIVER])
+    assert len(model.hulls) == 1
+    assert model.inertia[0] == pytest.approx([0, 0, 0])
+
+
 @pytest.mark.parametrize("file", ["cup.obj", "cup.stl", "cup.ply"])
 def test_mesh_files_are_read(file: str, tmp_path: Path) -> None:
     path = tmp_path / file
@@ -125,6 +131,7 @@ def test_a_file_called_mesh_bears_the_name_of_its_folder(tmp_path: Path, monkeyp
 # bad input
 
 CUBE = box([0.1, 0.1, 0.1])
+SLIVER = box([0.1, 0.1, 1e-7]).apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 1, 0]))
 
 
 def not_finite() -> trimesh.Trimesh:
@@ -153,7 +160,7 @@ def not_finite() -> trimesh.Trimesh:
         (lambda: ObjectModel.from_mesh(CUBE, friction=0.0, hulls=[CUBE]), r"has a friction of 0\.0"),
         (lambda: ObjectModel.from_mesh(CUBE, hulls=[]), "has no convex parts; give hulls=None to have them computed"),
         (lambda: ObjectModel.from_mesh(CUBE, hulls=[trimesh.Trimesh()]), "mesh hull of object is empty"),
-        (lambda: ObjectModel.from_mesh(CUBE, hulls=[box([0.1, 0.1, 0])]), "mesh hull of object is flat"),
+        (lambda: ObjectModel.from_mesh(CUBE, hulls=[SLIVER]), "has no convex parts; give hulls=None to have them"),
         (lambda: ObjectModel.from_mesh(CUBE, hulls=[box([100, 100, 100])]), "mesh hull of object is 100.0 m large"),
         (lambda: make_object("mug_99"), r"object 'mug_99' is unknown; known are ball_00\.\.\.03, .*mug_00\.\.\.07"),
         (lambda: make_object("teapot"), "object 'teapot' is unknown"),

@@ -19,7 +19,7 @@ from dexzoo.hand import Hand
 NUM_GRASPS = 6
 
 
-def scene_row(scene: int, **values: Any) -> dict[str, Any]:
+def scene_row(scene: int, **values: object) -> dict[str, Any]:
     row = {
         "scene": scene,
         "object": f"can_{scene:02d}",
@@ -61,7 +61,7 @@ def rows(world: Grasps, hand: Hand) -> dict[str, Any]:
     }
 
 
-def write(folder: Path, scene: int, view: dict[str, Any], rows: dict[str, Any], **values: Any) -> None:
+def write(folder: Path, scene: int, view: dict[str, Any], rows: dict[str, Any], **values: object) -> None:
     grasps = pa.table({"scene": [scene] * NUM_GRASPS, **rows})
     views = [{"scene": scene, "view": number, **view} for number in range(2)]
     write_scene(folder, scene_row(scene, **values), views, grasps)
@@ -129,7 +129,7 @@ def test_a_failure_leaves_nothing_behind(
 ) -> None:
     write_table, done = pq.write_table, []
 
-    def full_disk(*args: Any, **options: Any) -> None:
+    def full_disk(*args: object, **options: object) -> None:
         if len(done) == failing:
             raise OSError("no space left")
         done.append(write_table(*args, **options))

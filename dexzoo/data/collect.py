@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
@@ -40,6 +41,8 @@ def collect(folder: Path, num_scenes: int, workers: int = 1, seed: int = 0) -> I
     The same seed makes the same files on any number of workers. Killing it loses the scenes in flight.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    for unfinished in folder.glob(".scene_*"):  # of a run that was killed
+        shutil.rmtree(unfinished)
     missing = [i for i in range(num_scenes) if not (folder / f"scene_{i:06d}").exists()]
     yield from (f"scene {i} is there already" for i in range(num_scenes) if i not in set(missing))
     if workers == 1:

@@ -59,10 +59,11 @@ class ObjectModel:
             thin = f"{surface.extents.min() * 1000:.2f} mm thick, expected at least {MIN_EXTENT * 1000:g} mm"
             raise ValueError(f"mesh {label if isinstance(mesh, Mesh) else mesh} is flat: {thin}")
         parts = _decompose(surface) if hulls is None else [_read(hull, f"hull of {label}") for hull in hulls]
-        parts = [part for part in parts if part.extents.min() >= MIN_SLIVER]
-        if not parts:
+        convex = (part.convex_hull for part in parts)
+        solid = tuple(part for part in convex if 2 * part.volume / part.area >= MIN_SLIVER)  # a plate's thickness
+        if not solid:
             raise ValueError(f"object {label} has no convex parts; give hulls=None to have them computed")
-        return cls(label, surface, tuple(part.convex_hull for part in parts), float(mass), float(friction))
+        return cls(label, surface, solid, float(mass), float(friction))
 
     @property
     def inertia(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,0 +1,432 @@
+"""The command line, called in-process: results for people and machines, and one line for each wrong call."""
+
+import json
+import runpy
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from safetensors.torch import save_file
+
+from dexzoo import cli, planning
+from dexzoo.camera import Observation
+from dexzoo.data import collect as collecting
+from dexzoo.generators.heuristic import HeuristicGenerator
+from dexzoo.grasp import GRASP_TYPES, Grasps
+from dexzoo.models.em2 import EM2
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command; gives the exit status, what it wrote and its errors."""
+
+    def call(*args: object) -> tuple[int, str, str]:
+        status = cli.main([str(arg) for arg in args])
+        return status, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture(autouse=True)
+def fewer_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning, "HeuristicGenerator", partial(HeuristicGenerator, 500))
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An EM2 that has learnt nothing yet."""
+    torch.manual_seed(0)
+    return EM2(width=16).save(tmp_path_factory.mktemp("weights"))
+
+
+@pytest.fixture(scope="session")
+def frame(can_view: Observation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with depth.npy in metres, depth.png in tenths of a millimetre, and a camera file for each."""
+    folder = tmp_path_factory.mktemp("frame")
+    np.save(folder / "depth.npy", can_view.depth)
+    cv2.imwrite(str(folder / "depth.png"), (can_view.depth / 1e-4).round().astype(np.uint16))
+    camera = can_view.camera
+    values = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    values["T_world_camera"] = can_view.T_world_camera.tolist()
+    (folder / "camera.json").write_text(json.dumps(values))
+    (folder / "scaled.json").write_text(json.dumps(values | {"depth_scale": 1e-4}))
+    return folder
+
+
+@pytest.fixture
+def observed(frame: Path, weights: Path) -> list[object]:
+    """The options that name the observation and the model."""
+    return ["--depth", frame / "depth.npy", "--camera", frame / "camera.json", "--evaluator", weights]
+
+
+@pytest.fixture(scope="session")
+def some_grasps(can_grasps: Grasps, can_view: Observation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with six grasps of the can in either frame."""
+    folder = tmp_path_factory.mktemp("grasps")
+    can_grasps[:6].save(folder / "camera.safetensors")
+    can_grasps[:6].to_frame("world", can_view.T_world_camera).save(folder / "world.safetensors")
+    return folder
+
+
+# plan
+
+
+def test_plan_ranks_grasps(run: Run, observed: list[object]) -> None:
+    status, out, err = run("plan", *observed, "--num_grasps", 12, "--json")
+    assert (status, err) == (0, "")
+    rows = json.loads(out)["grasps"]
+    assert 0 < len(rows) <= 12
+    assert [row["rank"] for row in rows] == list(range(1, len(rows) + 1))
+    scores = [row["score"] for row in rows]
+    assert scores == sorted(scores, reverse=True)
+    assert all(0 <= score <= 1 for score in scores)
+    assert sorted(row["generator_rank"] for row in rows) == list(range(1, len(rows) + 1))
+    assert {row["type"] for row in rows} <= set(GRASP_TYPES)
+    assert all(row["refined"] == row["score"] for row in rows)
+    assert all(0.1 < np.linalg.norm(row["palm"]) < 1.2 for row in rows)
+
+
+def test_plan_writes_a_folder(run: Run, frame: Path, weights: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "plan"
+    observation = ["--depth", frame / "depth.png", "--camera", frame / "scaled.json", "--evaluator", weights]
+    status, text, err = run("plan", *observation, "--num_grasps", 8, "--refine", "--out", out)
+    assert (status, err) == (0, "")
+    assert "the ten best" in text
+    assert sorted(path.name for path in out.iterdir()) == ["best_grasp.png", "grasps.safetensors", "plan.json"]
+    plan = json.loads((out / "plan.json").read_text())
+    grasps = Grasps.load(out / "grasps.safetensors")
+    assert grasps.frame == plan["frame"] == "camera"
+    assert len(grasps) == len(plan["grasps"])
+    np.testing.assert_allclose(grasps.position[:, 6], [row["palm"] for row in plan["grasps"]], atol=1e-4)
+    picture = cv2.imread(str(out / "best_grasp.png"))
+    assert picture.shape[1] > 2 * picture.shape[0]
+
+
+def test_plan_repeats_itself(run: Run, observed: list[object]) -> None:
+    first, again, other = (run("plan", *observed, "--num_grasps", 5, "--json", "--seed", seed) for seed in (1, 1, 2))
+    assert first == again
+    assert first[1] != other[1]
+
+
+def test_no_feasible_grasp_is_a_failure_of_the_work(
+    run: Run, observed: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(planning, "HeuristicGenerator", partial(HeuristicGenerator, 1))
+    status, out, err = run("plan", *observed, "--out", tmp_path / "out")
+    assert (status, out) == (1, "")
+    assert err == "dexzoo: no feasible grasp is found: the object may be too large, too flat or out of reach\n"
+    assert not (tmp_path / "out").exists()
+
+
+# refine, verify, collect, models
+
+
+def test_refine_improves_a_file_of_grasps(run: Run, observed: list[object], some_grasps: Path, tmp_path: Path) -> None:
+    args = ["--grasps", some_grasps / "camera.safetensors", "--num_steps", 3, "--out", tmp_path / "new" / "better"]
+    status, out, err = run("refine", *observed, *args, "--json")
+    assert (status, err) == (0, "")
+    result = json.loads(out)
+    assert result["num_grasps"] == 6
+    assert 0 <= result["accepted"] <= 6
+    assert 0 < result["mean_score_before"] < 1
+    assert len(Grasps.load(tmp_path / "new" / "better")) == 6
+
+
+def test_verify_generates_and_tries(run: Run, weights: Path) -> None:
+    args = ["--object", "can_02", "--num_grasps", 10, "--evaluator", weights]
+    status, out, err = run("verify", *args, "--json")
+    assert (status, err) == (0, "")
+    result = json.loads(out)
+    rows = result["grasps"]
+    assert result["object"] == "can_02"
+    assert result["num_grasps"] == len(rows) == 10
+    assert result["hold"] == sum(row["success"] for row in rows)
+    assert result["success_rate"] == pytest.approx(result["hold"] / 10)
+    held = [row["rank"] for row in rows if row["success"]]
+    assert result["first_that_holds"] == (held[0] if held else None)
+
+
+def test_verify_tries_a_file_of_grasps_on_a_mesh(run: Run, some_grasps: Path, tmp_path: Path) -> None:
+    mesh = tmp_path / "tin.stl"
+    trimesh.creation.cylinder(0.035, 0.1, sections=24).export(mesh)
+    args = ["--object", mesh, "--hulls", mesh, "--mass", 0.1, "--grasps", some_grasps / "world.safetensors"]
+    status, out, err = run("verify", *args, "--trials", 2)
+    assert (status, err) == (0, "")
+    assert "verification of tin" in out
+    assert "success rate" in out
+
+
+def test_collect_makes_a_set_and_goes_on(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collecting, "NUM_GENERATED", 2)
+    monkeypatch.setattr(collecting, "NUM_NEIGHBOURS", 2)
+    monkeypatch.setattr(collecting, "HeuristicGenerator", lambda: HeuristicGenerator(100))
+    monkeypatch.setattr(collecting, "object_names", lambda: ["box_03"])
+    for count in (1, 2):
+        status, out, err = run("collect", "--out", tmp_path, "--scenes", count, "--json")
+        assert (status, err) == (0, "")
+        assert json.loads(out) == {"out": str(tmp_path), "scenes": count}
+    assert {path.name for path in tmp_path.glob("*.parquet")} == {"scenes.parquet", "views.parquet", "grasps.parquet"}
+
+
+def test_models_are_listed(run: Run) -> None:
+    status, out, err = run("models", "--json")
+    assert (status, err) == (0, "")
+    assert [row["name"] for row in json.loads(out)["models"]] == cli.list_models()
+    status, out, err = run("models")
+    assert (status, err) == (0, "")
+    assert all(name in out for name in cli.list_models())
+
+
+# help
+
+
+@pytest.mark.parametrize("args", [["--help"], []])
+def test_help_lists_all_commands(run: Run, args: list[str]) -> None:
+    status, out, err = run(*args)
+    assert (status, err) == (0, "")
+    for command in (*cli.TRAINING, "plan", "refine", "verify", "collect", "models"):
+        assert command in out
+
+
+@pytest.mark.parametrize("command", ["plan", "refine", "verify", "collect", "models", "fit"])
+def test_each_command_has_help(run: Run, command: str) -> None:
+    status, out, err = run(command, "--help")
+    assert (status, err) == (0, "")
+    assert "--seed" in out
+    assert "--json" in out
+
+
+def test_the_package_is_a_program(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["dexzoo", "models", "--json"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module("dexzoo", run_name="__main__")
+    assert end.value.code == 0
+    assert json.loads(capsys.readouterr().out)["models"]
+
+
+# wrong calls
+
+
+def refused(result: tuple[int, str, str], message: str) -> None:
+    """Exit status 2, nothing but one line of error, which holds the message."""
+    status, out, err = result
+    assert (status, out) == (2, ""), err
+    assert err.count("\n") == 1
+    assert err.startswith("dexzoo: ")
+    assert message in err
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["verfy"], "command 'verfy' is unknown, did you mean verify? use one of fit, validate, test, predict, plan"),
+        (["--json", "models"], "unrecognized arguments: --json; see python -m dexzoo COMMAND --help"),
+        (["plan"], "required: --depth, --camera; see python -m dexzoo plan --help"),
+        (["plan", "--depth"], "--depth: expected one argument"),
+        (["plan", "--depth", "d", "--camera", "c", "--speed", "3"], "unrecognized arguments: --speed 3"),
+        (["plan", "--depth", "d", "--camera", "c", "--num_grasps", "0"], "--num_grasps: Not of type PositiveInt"),
+        (["plan", "--depth", "d", "--camera", "c", "--seed", "-1"], "--seed: Not of type NonNegativeInt"),
+        (["refine", "--depth", "d", "--camera", "c"], "required: --grasps"),
+        (
+            ["refine", "--depth", "d", "--camera", "c", "--grasps", "g", "--variables", "wrist"],
+            "--variables: invalid choice: 'wrist'",
+        ),
+        (["verify"], "required: --object"),
+        (["verify", "--object", "can_02", "--trials", "two"], "--trials: Not of type PositiveInt"),
+        (["verify", "--object", "can_99"], "object 'can_99' is unknown; known are ball_00...03"),
+        (["verify", "--object", "none.obj"], "mesh none.obj does not exist"),
+        (["verify", "--object", "can_02", "--mass", "-1"], "object can_02 has a mass of -1.0 kg; give a positive one"),
+        (["verify", "--object", "can_02", "--friction", "3"], "has a friction of 3.0; give one in (0, 2]"),
+        (["collect"], "required: --out"),
+        (["fit"], "fit needs a configuration that says what the model is; add --config em2.yaml"),
+        (["fit", "--config", "em9.yaml"], "configuration em9.yaml does not exist"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_wrong_calls_get_one_line(
+    run: Run, args: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused(run(*args), message)
+    assert not list(tmp_path.iterdir())
+
+
+def change_camera(folder: Path, frame: Path, **values: object) -> None:
+    camera = json.loads((frame / "camera.json").read_text()) | values
+    (folder / "camera.json").write_text(
+        json.dumps({name: value for name, value in camera.items() if value is not None})
+    )
+
+
+BAD_DEPTHS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "of another size": (lambda depth: depth[:-1], "depth is 640 x 479 pixels, but the camera is 640 x 480"),
+    "in millimetres": (lambda depth: depth * 1000, "looks like millimetres; give metres"),
+    "zero": (lambda depth: depth * 0, "depth holds no reading: every pixel is zero, negative, NaN or infinite"),
+    "NaN": (lambda depth: depth * np.nan, "depth holds no reading"),
+    "infinite": (lambda depth: depth + np.inf, "depth holds no reading"),
+    "three-dimensional": (lambda depth: np.stack([depth] * 3), "has 3 dimensions, expected one channel of depth"),
+    "in integers": (lambda depth: (depth * 1000).astype(np.uint16), "has no depth_scale (metres per unit"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_DEPTHS)
+def test_bad_depth_gets_one_line(run: Run, frame: Path, weights: Path, tmp_path: Path, kind: str) -> None:
+    change, message = BAD_DEPTHS[kind]
+    with np.errstate(invalid="ignore"):
+        np.save(tmp_path / "depth.npy", change(np.load(frame / "depth.npy")))
+    args = ["--depth", tmp_path / "depth.npy", "--camera", frame / "camera.json", "--evaluator", weights]
+    refused(run("plan", *args, "--out", tmp_path / "out"), message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_table_without_object_gets_one_line(
+    run: Run, can_view: Observation, frame: Path, weights: Path, tmp_path: Path
+) -> None:
+    T = can_view.T_world_camera
+    np.save(tmp_path / "depth.npy", -T[2, 3] / (can_view.camera.directions() @ T[2, :3]))
+    args = ["--depth", tmp_path / "depth.npy", "--camera", frame / "camera.json", "--evaluator", weights]
+    refused(run("plan", *args, "--out", tmp_path / "out"), "no object is seen above the table")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"fx": None}, "camera.json has no fx; it needs width, height, fx, fy, cx, cy"),
+        ({"fy": "wide"}, "camera.json: fy is 'wide', expected a number"),
+        ({"T_world_camera": [[1, 0], [0, 1]]}, "camera.json: T_world_camera must be a finite 4 x 4 matrix"),
+    ],
+)
+def test_a_bad_camera_gets_one_line(
+    run: Run, frame: Path, weights: Path, tmp_path: Path, values: dict[str, object], message: str
+) -> None:
+    change_camera(tmp_path, frame, **values)
+    args = ["--depth", frame / "depth.npy", "--camera", tmp_path / "camera.json", "--evaluator", weights]
+    refused(run("plan", *args), message)
+
+
+def test_files_that_are_missing_or_unreadable_get_one_line(
+    run: Run, frame: Path, weights: Path, some_grasps: Path, tmp_path: Path
+) -> None:
+    text = tmp_path / "text"
+    text.write_text("neither picture, nor JSON, nor tensors")
+    depth, camera, grasps = frame / "depth.npy", frame / "camera.json", some_grasps / "camera.safetensors"
+    cases = [
+        (tmp_path / "none.npy", camera, grasps, "none.npy does not exist"),
+        (text, camera, grasps, "text cannot be read; give a 16-bit PNG or a .npy file in metres"),
+        (depth, tmp_path / "none.json", grasps, "camera file"),
+        (depth, text, grasps, "text is not JSON"),
+        (depth, camera, tmp_path / "none", "none does not exist"),
+        (depth, camera, text, "text is not a safetensors file of grasps"),
+        (depth, camera, weights, "holds no tensor named waypoints; write it with Grasps.save"),
+        (tmp_path, camera, grasps, "does not exist"),
+    ]
+    for d, c, g, message in cases:
+        out = tmp_path / "out"
+        args = ["--depth", d, "--camera", c, "--grasps", g, "--evaluator", weights, "--out", out]
+        refused(run("refine", *args), message)
+        assert not out.exists()
+
+
+def test_models_that_are_not_to_be_had_get_one_line(
+    run: Run, frame: Path, weights: Path, tmp_path: Path, observed: list[object]
+) -> None:
+    def plan(evaluator: object) -> tuple[int, str, str]:
+        return run("plan", *observed[:4], "--evaluator", evaluator, "--out", tmp_path / "out")
+
+    refused(plan("em22"), "model 'em22' is unknown, did you mean em2? known are em1, em2")
+    refused(plan(tmp_path / "none.safetensors"), "none.safetensors do not exist; give a model's name")
+    (tmp_path / "em2.json").write_text(weights.with_suffix(".json").read_text())
+    (tmp_path / "em2.safetensors").write_bytes(weights.read_bytes()[:-9])
+    refused(plan(tmp_path / "em2.safetensors"), "em2.safetensors is truncated or not a safetensors file")
+    (tmp_path / "model.pt").write_bytes(b"\x80\x04K\x01.")
+    refused(plan(tmp_path / "model.pt"), "model.pt is a pickle, which could run code, and was not read")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("as_users_run_it")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda w: w[:, :5], "grasps have shape (6, 5, 28), expected (num_grasps, 10, 28)"),
+        (lambda w: torch.cat((w[..., :3], 2 * w[..., 3:7], w[..., 7:]), -1), "has length 2.000, expected 1 (wxyz"),
+        (lambda w: torch.cat((w[..., :7], w[..., 7:27] + 2, w[..., 27:]), -1), "outside its limits"),
+        (lambda w: torch.cat((w[..., :27], w[..., 27:] + 20), -1), "expected 0 to 9 (number 27)"),
+        (lambda w: w * torch.nan, "grasp 0 holds a number that is not finite"),
+    ],
+    ids=["shape", "quaternion", "joints", "type", "nan"],
+)
+def test_bad_grasps_get_one_line(
+    run: Run,
+    observed: list[object],
+    some_grasps: Path,
+    tmp_path: Path,
+    change: Callable[[torch.Tensor], torch.Tensor],
+    message: str,
+) -> None:
+    good = Grasps.load(some_grasps / "world.safetensors")
+    path = tmp_path / "grasps.safetensors"
+    save_file({"waypoints": change(good.waypoints).contiguous()}, path, metadata={"frame": "world"})
+    refused(run("verify", "--object", "can_02", "--grasps", path), message)
+    refused(run("refine", *observed, "--grasps", path, "--out", tmp_path / "out"), message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_verify_wants_grasps_in_the_world(run: Run, some_grasps: Path) -> None:
+    args = ["--object", "can_02", "--grasps", some_grasps / "camera.safetensors"]
+    refused(
+        run("verify", *args), "camera.safetensors holds grasps in the camera frame; save them with to_frame('world'"
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: trimesh.creation.box([80.0, 60.0, 100.0]), "is 100.0 m large and looks like millimetres"),
+        (lambda: trimesh.creation.box([0.1, 0.1, 1e-6]), "is flat"),
+    ],
+    ids=["millimetres", "flat"],
+)
+def test_a_bad_mesh_gets_one_line(run: Run, tmp_path: Path, make: Callable[[], trimesh.Trimesh], message: str) -> None:
+    make().export(tmp_path / "thing.stl")
+    refused(run("verify", "--object", tmp_path / "thing.stl"), message)
+    (tmp_path / "empty.obj").write_text("")
+    refused(run("verify", "--object", tmp_path / "empty.obj"), "empty.obj is empty")
+
+
+def test_out_must_be_of_the_right_kind(
+    run: Run, observed: list[object], some_grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is looked at before the work is done."""
+    monkeypatch.setattr(cli, "plan", lambda *_: pytest.fail("the work was done"))
+    (tmp_path / "file").write_text("kept")
+    refused(run("plan", *observed, "--out", tmp_path / "file"), "file is a file; give a folder")
+    refused(run("collect", "--out", tmp_path / "file"), "file is a file; give a folder")
+    args = ["--grasps", some_grasps / "camera.safetensors", "--out", tmp_path]
+    refused(run("refine", *observed, *args), "is a folder; give a file")
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_failures_of_the_machine_are_status_1(
+    run: Run, observed: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError("no space left\non the device")
+
+    monkeypatch.setattr(cli, "plan", full)
+    status, out, err = run("plan", *observed)
+    assert (status, out, err) == (1, "", "dexzoo: no space left on the device\n")
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "plan", stopped)
+    assert run("plan", *observed) == (1, "", "dexzoo: stopped\n")
