@@ -37,8 +37,9 @@ def box_slope(local: Tensor, half: Tensor) -> Tensor:
     outside = local.abs() - half
     slope = outside.clamp_min(0)
     length = slope.square().sum(0).sqrt_()
-    inside = (length == 0).nonzero(as_tuple=True)
-    slope[(outside[(slice(None), *inside)].argmax(0), *inside)] = 1
+    inside = length == 0
+    place = inside.nonzero(as_tuple=True)
+    slope[(outside[:, inside].argmax(0), *place)] = 1
     length[inside] = 1
     return slope.mul_(local.sign()).div_(length)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import math
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dexzoo.geometry import SegmentPairs, box_distance, capsule_distance
+from dexzoo.geometry import PointDistance, SegmentPairs
 from dexzoo.hand_spec import HandSpec, Inertia, Joint, Pad, Primitive, Side
 from dexzoo.kinematics import KinematicTree, LinkPoses
 
@@ -80,21 +81,20 @@ class Hand(nn.Module):
         shapes = sorted(self.spec.primitives, key=lambda shape: self.solid_names.index(shape.link))
         self.shapes = shapes
         self._shape_link = [self.link_names.index(shape.link) for shape in shapes]
-        solid = [self.solid_names.index(shape.link) for shape in shapes]
-        self._shape_groups = [[i for i, s in enumerate(solid) if s == k] for k in range(len(self.solid_names))]
+        ends = np.cumsum([sum(shape.link == name for shape in shapes) for name in self.solid_names]).tolist()
+        self._shape_groups = [slice(*bounds) for bounds in itertools.pairwise([0, *ends])]
         self._shape_pose = torch.tensor(np.stack([shape.pose for shape in shapes]))
         self._shape_half = torch.tensor(np.stack([shape.half for shape in shapes]))
         self._shape_radius = torch.tensor([shape.radius for shape in shapes], dtype=torch.float64)
-        joined = {frozenset((joint.parent, joint.child)) for joint in self.spec.joints}
-        ignored = joined | {frozenset(pair) for pair in self.spec.exclude}
+        ignored = self.spec.joined | {frozenset(pair) for pair in self.spec.exclude}
         meeting = [
             p
             for p in itertools.combinations(range(len(self.solid_names)), 2)
             if frozenset(self.solid_names[i] for i in p) not in ignored
         ]
         self.self_pairs = [(self.solid_names[i], self.solid_names[j]) for i, j in meeting]
-        groups = [(self._shape_groups[i], self._shape_groups[j]) for i, j in meeting]
-        self._pairs = SegmentPairs.between(shapes, groups)
+        members = [range(len(shapes))[group] for group in self._shape_groups]
+        self._pairs = SegmentPairs.between(shapes, [(members[i], members[j]) for i, j in meeting])
 
     def _cast(self, like: Tensor) -> _Constants:
         """Every constant in the dtype and on the device of a tensor, kept for the next call."""
@@ -160,14 +160,15 @@ class Hand(nn.Module):
     def check(self, q20: Float[Tensor, "*batch joint"], tolerance: float = 1e-3) -> None:
         """Raise ValueError that names the joint, its value and its limits when a posture cannot be."""
         self._check_size(q20)
-        excess = torch.maximum(self.lower.to(q20) - q20, q20 - self.upper.to(q20))
-        if not torch.isfinite(q20).all():
-            raise ValueError("joint angles hold a number that is not finite")
+        excess = torch.maximum(self.lower.to(q20) - q20, q20 - self.upper.to(q20)).nan_to_num(nan=torch.inf)
         if excess.numel() and excess.max() > tolerance:
             worst = int(excess.argmax())
             joint = worst % len(self.joint_names)
+            angle, name = float(q20.reshape(-1)[worst]), self.joint_names[joint]
+            if not math.isfinite(angle):
+                raise ValueError(f"joint {name} is at {angle} rad, which is not finite")
             raise ValueError(
-                f"joint {self.joint_names[joint]} is at {float(q20.reshape(-1)[worst]):.3f} rad, outside its limits "
+                f"joint {name} is at {angle:.3f} rad, outside its limits "
                 f"{float(self.lower[joint]):.3f} to {float(self.upper[joint]):.3f}"
             )
 
@@ -228,22 +229,17 @@ class Hand(nn.Module):
         links: link poses in the frame of the points. points broadcast against the poses. Exact for capsules and
         boxes; where several primitives make one link, the nearest counts.
         """
+        constants = self._cast(links)
         poses = self.shape_poses(links)
-        half, radius = self._cast(links).shape_half, self._cast(links).shape_radius
         inverse = poses[..., :3, :3].mT
-        local = inverse @ points.mT[..., None, :, :] if points.ndim > 2 else inverse @ points.mT
-        local = local - inverse @ poses[..., :3, 3:]  # (*both, shape, 3, point): rows, so that each is one stretch
-        distance = [
-            capsule_distance(local[..., i, :, :], half[i, 0], radius[i])
-            if shape.is_capsule
-            else box_distance(local[..., i, :, :], half[i], radius[i])
-            for i, shape in enumerate(self.shapes)
-        ]
-        nearest = [
-            distance[group[0]] if len(group) == 1 else torch.stack([distance[i] for i in group]).amin(0)
-            for group in self._shape_groups
-        ]
-        return torch.stack(nearest, dim=-2)
+        transform = torch.cat((inverse, -inverse @ poses[..., :3, 3:]), -1)  # (*batch, shape, 3, 4)
+        batch = torch.broadcast_shapes(transform.shape[:-3], points.shape[:-2])
+        transform = transform.expand(*batch, *transform.shape[-3:]).reshape(-1, *transform.shape[-3:])
+        if points.ndim > 2:
+            points = points.expand(*batch, *points.shape[-2:]).reshape(math.prod(batch), *points.shape[-2:])
+        half, radius = constants.shape_half, constants.shape_radius
+        distance: Tensor = PointDistance.apply(transform, points, half, radius, self._shape_groups)
+        return distance.reshape(*batch, *distance.shape[-2:])
 
     def self_distance(self, links: Float[Tensor, "*batch link 4 4"]) -> Float[Tensor, "*batch pair"]:
         """Distance in metres between the links of each of `self_pairs`, negative where they overlap.
@@ -252,8 +248,9 @@ class Hand(nn.Module):
         Overlap is measured by the deepest point of one link's core (a capsule's axis, a box's edge) in the other.
         """
         constants = self._cast(links)
-        poses = self.shape_poses(links)
-        return self._pairs.distance(poses, constants.shape_half, constants.shape_radius, len(self.self_pairs))
+        poses = self.shape_poses(links).reshape(-1, len(self.shapes), 4, 4)
+        distance = self._pairs.distance(poses, constants.shape_half, constants.shape_radius, len(self.self_pairs))
+        return distance.reshape(*links.shape[:-3], len(self.self_pairs))
 
     def clearance(
         self, links: Float[Tensor, "*batch link 4 4"], plane: Float[Tensor, "*plane 4"]

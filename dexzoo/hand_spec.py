@@ -6,6 +6,8 @@ A hand is a folder with a URDF (kinematics, masses, limits, coupling) and a hand
 from __future__ import annotations
 
 import difflib
+import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +18,7 @@ import trimesh
 import yaml
 import yourdfpy
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dexzoo.resources import resource
 
@@ -121,24 +124,35 @@ class HandSpec:
                 side=config["side"],
                 palm=config["palm"],
                 joints=joints,
-                joint_names=tuple(joint for finger in config["joints"] for joint in finger),
+                joint_names=tuple(joint for finger in config["joints"] for joint in _finger(finger)),
                 link_names=(config["palm"], *(joint.child for joint in joints)),
                 inertias={link.name: _inertia(link.inertial) for link in urdf.links if link.inertial is not None},
                 primitives=tuple(
                     _primitive(link, shape) for link, shapes in config["primitives"].items() for shape in shapes
                 ),
                 pads={
-                    finger: Pad(pad["link"], np.array(pad["point"], float), np.array(pad["normal"], float))
+                    finger: Pad(
+                        pad["link"],
+                        _vector(pad["point"], f"point of the pad {finger}"),
+                        _unit(pad["normal"], f"normal of the pad {finger}"),
+                    )
                     for finger, pad in config.get("pads", {}).items()
                 },
                 exclude=tuple((a, b) for a, b in config.get("exclude", [])),
             )
         except KeyError as error:
             raise ValueError(f"{path} lacks the entry {error}") from None
+        except (AttributeError, TypeError) as error:
+            raise ValueError(f"{path}: an entry lacks the form it has in robots/dlr2/hand.yaml: {error}") from None
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
         _check(spec, path)
         if side != spec.side:
             if "mirror" not in config:
-                raise ValueError(f"hand {folder.name} has no {side} side: {path} has no entry mirror")
+                raise ValueError(
+                    f'hand {folder.name} has no {side} side: {path} has no entry mirror; use side="{spec.side}"'
+                )
+            _check_links(spec, path, config["mirror"])
             spec = _mirrored(spec, side, config["mirror"])
         return spec
 
@@ -147,6 +161,16 @@ class HandSpec:
         """Names of the joints that move by themselves, in posture order."""
         free = {joint.name for joint in self.joints if joint.mimic is None}
         return tuple(name for name in self.joint_names if name in free)
+
+    @property
+    def joined(self) -> frozenset[frozenset[str]]:
+        """Pairs of links that share a joint, where links fixed to each other are one: they cannot but touch."""
+        solid = {self.palm: self.palm}  # of each link, the first of those it is fixed to
+        for joint in self.joints:
+            solid[joint.child] = solid[joint.parent] if joint.axis is None else joint.child
+        shared = {frozenset((solid[joint.parent], solid[joint.child])) for joint in self.joints}
+        pairs = (frozenset(pair) for pair in itertools.combinations(self.link_names, 2))
+        return frozenset(pair for pair in pairs if frozenset(solid[link] for link in pair) in shared)
 
     def joint(self, name: str) -> Joint:
         """The joint of that name."""
@@ -178,8 +202,8 @@ def _read_urdf(path: Path) -> yourdfpy.Robot:
     try:
         ElementTree.parse(path)  # yourdfpy would make do with half a file
         return yourdfpy.URDF.load(str(path), load_meshes=False, build_scene_graph=False).robot
-    except (ValueError, SyntaxError) as error:
-        raise ValueError(f"{path} is not a URDF: {error}") from None
+    except (AttributeError, KeyError, SyntaxError, TypeError, ValueError) as error:  # what yourdfpy raises
+        raise ValueError(f"{path.name} is not a URDF: {error}") from None
 
 
 def _joint(joint: yourdfpy.Joint) -> Joint:
@@ -194,7 +218,7 @@ def _joint(joint: yourdfpy.Joint) -> Joint:
         parent=joint.parent,
         child=joint.child,
         origin=np.eye(4) if joint.origin is None else np.asarray(joint.origin, float),
-        axis=np.asarray(joint.axis, float) / np.linalg.norm(joint.axis) if moves else None,
+        axis=_unit(joint.axis, f"axis of joint {joint.name}") if moves else None,
         lower=limit.lower or 0.0 if moves else 0.0,
         upper=limit.upper or 0.0 if moves else 0.0,
         effort=limit.effort or 0.0 if moves else 0.0,
@@ -211,32 +235,65 @@ def _inertia(inertial: yourdfpy.Inertial) -> Inertia:
     return Inertia(float(inertial.mass), origin[:3, 3], turn @ np.asarray(inertial.inertia, float) @ turn.T)
 
 
+def _finger(joints: list[str]) -> list[str]:
+    if not isinstance(joints, list):
+        raise ValueError(f"joint {joints} stands alone; joints takes a list for each finger, such as [[a, b], [c]]")
+    return joints
+
+
+def _vector(values: list[float] | NDArray[np.float64], what: str) -> NDArray[np.float64]:
+    try:
+        vector = np.asarray(values, float)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{what} is {values}, expected three numbers")
+    return vector
+
+
+def _unit(values: list[float] | NDArray[np.float64], what: str) -> NDArray[np.float64]:
+    vector = _vector(values, what)
+    if not vector.any():
+        raise ValueError(f"{what} is zero, expected a direction")
+    return vector / np.linalg.norm(vector)
+
+
 def _primitive(link: str, shape: dict[str, Any]) -> Primitive:
     pose = np.eye(4)
     if "box" in shape:
-        pose[:3, 3] = shape["box"]["center"]
-        return Primitive(link, pose, np.array(shape["box"]["half"], float), 0.0)
+        box, what = shape["box"], f"of the box of link {link}"
+        half = _vector(box["half"], f"half {what}")
+        if (half <= 0).any():
+            raise ValueError(f"half {what} is {half.tolist()}, expected positive numbers")
+        pose[:3, :3] = Rotation.from_euler("xyz", _vector(box.get("rpy", np.zeros(3)), f"rpy {what}")).as_matrix()
+        pose[:3, 3] = _vector(box["center"], f"center {what}")
+        return Primitive(link, pose, half, 0.0)
     if "capsule" in shape:
-        start, end = (np.array(shape["capsule"][key], float) for key in ("from", "to"))
-        length = float(np.linalg.norm(end - start))
+        capsule, what = shape["capsule"], f"of the capsule of link {link}"
+        start, end = (_vector(capsule[key], f"{key} {what}") for key in ("from", "to"))
+        radius, length = float(capsule["radius"]), float(np.linalg.norm(end - start))
+        if radius <= 0 or length <= 0:
+            raise ValueError(f"radius and length {what} are {radius:g} and {length:g}, expected positive numbers")
         x = (end - start) / length
         y = np.cross(np.eye(3)[np.abs(x).argmin()], x)
         y /= np.linalg.norm(y)
         pose[:3, :3] = np.column_stack((x, y, np.cross(x, y)))
         pose[:3, 3] = (start + end) / 2
-        return Primitive(link, pose, np.array([length / 2, 0, 0]), float(shape["capsule"]["radius"]))
+        return Primitive(link, pose, np.array([length / 2, 0, 0]), radius)
     raise ValueError(f"primitive of link {link} is {', '.join(shape)}; use capsule or box")
 
 
 def _tree_order(root: str, joints: list[Joint]) -> tuple[Joint, ...]:
+    children = [joint.child for joint in joints]
+    for link in (root, *children):
+        if children.count(link) > (link != root):
+            raise ValueError(f"link {link} hangs from too many joints; the URDF must be a tree that starts at {root}")
     ordered: list[Joint] = []
     stack = [root]
     while stack:
-        children = [joint for joint in joints if joint.parent == stack[-1]]
         link = stack.pop()
-        incoming = [joint for joint in joints if joint.child == link]
-        ordered.extend(incoming if link != root else [])
-        stack.extend(joint.child for joint in reversed(children))
+        ordered.extend(joint for joint in joints if joint.child == link)
+        stack.extend(joint.child for joint in reversed(joints) if joint.parent == link)
     if len(ordered) != len(joints):
         lost = {joint.name for joint in joints} - {joint.name for joint in ordered}
         raise ValueError(f"the URDF's joints {', '.join(sorted(lost))} are not reached from the palm link {root}")
@@ -244,23 +301,47 @@ def _tree_order(root: str, joints: list[Joint]) -> tuple[Joint, ...]:
 
 
 def _check(spec: HandSpec, path: Path) -> None:
-    moving = {joint.name for joint in spec.joints if joint.axis is not None}
-    if len(set(spec.joint_names)) != len(spec.joint_names) or set(spec.joint_names) != moving:
-        odd = moving.symmetric_difference(spec.joint_names) or set(spec.joint_names)
+    moving = {joint.name: joint for joint in spec.joints if joint.axis is not None}
+    if len(set(spec.joint_names)) != len(spec.joint_names) or set(spec.joint_names) != set(moving):
+        odd = set(moving).symmetric_difference(spec.joint_names) or set(spec.joint_names)
         raise ValueError(f"{path}: joints and the URDF's moving joints differ in {', '.join(sorted(odd))}")
-    for joint in spec.joints:
-        if joint.mimic is not None and joint.mimic not in moving:
+    if not spec.primitives:
+        raise ValueError(f"{path}: primitives is empty; give at least one link a box or a capsule")
+    for joint in moving.values():
+        if not joint.lower < joint.upper:
+            raise ValueError(
+                f"{path}: joint {joint.name} has the limits {joint.lower:g} to {joint.upper:g} in the URDF; "
+                "give it a range, or make it a fixed joint"
+            )
+        if joint.mimic is None:
+            continue
+        if joint.mimic not in moving:
             raise ValueError(f"{path}: joint {joint.name} is coupled to {joint.mimic}, which does not exist")
-        if joint.mimic is not None and joint.mimic not in spec.freedoms:
+        if joint.mimic not in spec.freedoms:
             raise ValueError(f"{path}: joint {joint.name} is coupled to {joint.mimic}, which is coupled itself")
-    used = {p.link for p in spec.primitives} | {p.link for p in spec.pads.values()} | set(sum(spec.exclude, ()))
-    for link in sorted(used - set(spec.link_names)):
+        leader = moving[joint.mimic]
+        for angle in (leader.lower, leader.upper):
+            follows = joint.multiplier * angle + joint.offset
+            if not joint.lower - 1e-3 <= follows <= joint.upper + 1e-3:
+                raise ValueError(
+                    f"{path}: joint {joint.name} would follow {leader.name} at {angle:g} to {follows:.3f} rad, outside "
+                    f"its limits {joint.lower:.3f} to {joint.upper:.3f}; widen them, or narrow those of {leader.name}"
+                )
+    _check_links(spec, path, {p.link for p in spec.primitives} | {p.link for p in spec.pads.values()})
+    _check_links(spec, path, set(sum(spec.exclude, ())))
+
+
+def _check_links(spec: HandSpec, path: Path, links: Iterable[str]) -> None:
+    for link in sorted(set(links) - set(spec.link_names)):
         near = difflib.get_close_matches(link, spec.link_names, 1)
         raise ValueError(f"{path}: link {link} is not in the URDF" + (f", did you mean {near[0]}?" if near else ""))
 
 
 def _mirrored(spec: HandSpec, side: Side, axes: dict[str, str]) -> HandSpec:
-    """The other side's hand: each link's frame mirrored along its own axis, so that joint axes and limits stay."""
+    """The other side's hand: each link's frame mirrored along an axis of its own.
+
+    A joint's axis stays where it lies along that axis or across it, and its angle changes sign in the second case.
+    """
     flip = {link: np.array(_MIRROR[axes.get(link, "z")]) for link in spec.link_names}
 
     def mirror(
@@ -269,13 +350,27 @@ def _mirrored(spec: HandSpec, side: Side, axes: dict[str, str]) -> HandSpec:
         mirrored: NDArray[np.float64] = np.append(parent, 1.0)[:, None] * pose * np.append(child, 1.0)
         return mirrored
 
+    sign: dict[str, float] = {}  # of each joint's angle
+
     def turn(joint: Joint) -> Joint:
-        return replace(joint, origin=mirror(flip[joint.parent], joint.origin, flip[joint.child]))
+        joint = replace(joint, origin=mirror(flip[joint.parent], joint.origin, flip[joint.child]))
+        if joint.axis is None:
+            return joint
+        image = flip[joint.child] * joint.axis
+        sign[joint.name] = -1.0 if image @ joint.axis > 0 else 1.0  # a mirror image turns the other way
+        lower, upper = sorted((sign[joint.name] * joint.lower, sign[joint.name] * joint.upper))
+        return replace(joint, axis=-sign[joint.name] * image, lower=lower, upper=upper)
+
+    def follow(joint: Joint) -> Joint:
+        if joint.mimic is None:
+            return joint
+        own = sign[joint.name]
+        return replace(joint, multiplier=own * sign[joint.mimic] * joint.multiplier, offset=own * joint.offset)
 
     return replace(
         spec,
         side=side,
-        joints=tuple(turn(joint) for joint in spec.joints),
+        joints=tuple(follow(joint) for joint in [turn(joint) for joint in spec.joints]),
         inertias={
             link: Inertia(i.mass, flip[link] * i.center, np.outer(flip[link], flip[link]) * i.matrix)
             for link, i in spec.inertias.items()

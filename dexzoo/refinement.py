@@ -57,7 +57,8 @@ _SPREAD = torch.tensor([0.05] * 3 + [0.3] * 4 + [0.3] * 20 + [0.0])
 class Refinement:
     """What became of each grasp; tensors (num_grasps,).
 
-    grasps: the refined grasp where accepted, else the one given; same order and frame as given.
+    grasps: the refined grasp where accepted, else the one given; same order and frame as given. The log-likelihood
+    stays that of the grasp that was proposed.
     score_before, score_after: probability of success of the given and of the returned grasps.
     accepted: whether the objective rose: for "grip" the log-odds less weighted penalties, else the log-odds.
     penalties: of the returned grasps: "table", deepest metres below the table; "penetration", deepest metres of an

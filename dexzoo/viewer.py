@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 PALM_COLOUR = (150, 155, 165)
 FINGER_COLOURS = ((213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
-STEP = 0.5  # degrees that one press of an arrow key moves a joint
+STEP = 0.5  # degrees between two places of a slider
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class HandPage:
         gui.set_panel_label(f"{spec.name}, {spec.side} hand")
         coupled = [f"{joint.name} = {_coupling(joint)}" for joint in spec.joints if joint.mimic is not None]
         gui.add_markdown(
-            "Each slider moves one joint between its limits, in degrees: drag it, type, or use the arrow keys."
+            "Each slider moves one joint between its limits, in degrees: drag it or type a number."
             + (f" Coupled joints follow: {', '.join(coupled)}." if coupled else "")
             + " The floor's squares are 5 cm."
         )

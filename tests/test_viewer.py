@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -141,18 +142,25 @@ def test_every_free_joint_has_a_slider_between_its_limits(tab: Page, hand: Hand)
     assert set(hand.spec.pads) <= set(tab.locator("body").inner_text().split())
 
 
-def test_arrow_keys_move_that_finger_alone(tab: Page, page: HandPage) -> None:
+def test_dragging_a_slider_moves_that_finger_alone(tab: Page, page: HandPage) -> None:
     before, drawn = link_poses(page), still_picture(tab)
-    row(tab, "index_mcp").get_by_role("slider").focus()
-    for _ in range(60):
-        tab.keyboard.press("ArrowRight")
-    asked = torch.zeros(20, dtype=torch.float64)
-    asked[page.hand.joint_names.index("index_mcp")] = torch.deg2rad(torch.tensor(30.0))
-    wait_for(tab, lambda: shows(page, asked))
+    slider = row(tab, "index_mcp").get_by_role("slider")
+    slider.scroll_into_view_if_needed()
+    handle = slider.bounding_box()
+    assert handle is not None
+    x, y = handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2
+    tab.mouse.move(x, y)
+    tab.mouse.down()
+    tab.mouse.move(x + 60, y, steps=5)
+    tab.mouse.up()
+    wait_for(tab, lambda: page.posture.count_nonzero() == 1 and shows(page, page.posture))
+    angle = page.posture[page.hand.joint_names.index("index_mcp")]
+    assert float(str(slider.get_attribute("aria-valuenow"))) == pytest.approx(math.degrees(angle), abs=1e-3)
     moved = (link_poses(page) - before).abs().amax((1, 2)) > 1e-9
     names = {name for name, is_moved in zip(page.links, moved, strict=True) if is_moved}
     assert names == {"index_proximal", "index_middle", "index_distal", "index_tip"}
-    wait_for(tab, lambda: float((picture(tab) != drawn).any(-1).mean()) > 0.002)
+    wait_for(tab, lambda: bool((picture(tab) != drawn).any(-1).mean() > 0.005))
+    assert np.array_equal(still_picture(tab)[250:], drawn[250:])  # the lower palm and the floor before it
 
 
 def test_a_typed_number_moves_the_coupled_joint_too(tab: Page, page: HandPage) -> None:
