@@ -29,6 +29,7 @@ from dexzoo.refinement import refine
 from dexzoo.sim import ObjectModel, Scene
 from dexzoo.sim.shapes import make_object
 from dexzoo.verification import verify
+from dexzoo.viewer import view
 
 TRAINING = ("fit", "validate", "test", "predict")
 OK, FAILED, WRONG_CALL = 0, 1, 2
@@ -136,6 +137,11 @@ def _parser() -> ArgumentParser:
     command.add_argument("--out", type=Path, required=True, help="folder of the grasp set")
     command.add_argument("--scenes", type=PositiveInt, default=100, help="how many scenes")
     command.add_argument("--workers", type=PositiveInt, default=1, help="processes")
+
+    command = add("view", "Show a hand in the browser, with a slider for each free joint, until interrupted.")
+    command.add_argument("--hand", default="dlr2", help="name in robots/, or a folder with a URDF and a hand.yaml")
+    command.add_argument("--side", default="right", choices=["right", "left"], help="which hand")
+    command.add_argument("--port", type=NonNegativeInt, default=8080, help="of this machine; 0 takes any free one")
 
     add("models", "List the evaluative models.")
     return parser
@@ -283,6 +289,11 @@ def _collect(options: Namespace) -> Result:
     return summary, _pairs("grasp set", summary)
 
 
+def _view(options: Namespace) -> Result:
+    view(options.hand, options.side, options.port, options.seed)
+    return {}, None
+
+
 def _models(options: Namespace) -> Result:
     rows = []
     table = Table(title="evaluative models")
@@ -310,5 +321,6 @@ _COMMANDS: dict[str, Callable[[Namespace], Result]] = {
     "refine": _refine,
     "verify": _verify,
     "collect": _collect,
+    "view": _view,
     "models": _models,
 }

@@ -163,14 +163,20 @@ class HandSpec:
         return tuple(name for name in self.joint_names if name in free)
 
     @property
-    def joined(self) -> frozenset[frozenset[str]]:
-        """Pairs of links that share a joint, where links fixed to each other are one: they cannot but touch."""
-        solid = {self.palm: self.palm}  # of each link, the first of those it is fixed to
+    def fixed_to(self) -> dict[str, str]:
+        """For each link, the first of those that are fixed to each other and to it."""
+        first = {self.palm: self.palm}
         for joint in self.joints:
-            solid[joint.child] = solid[joint.parent] if joint.axis is None else joint.child
-        shared = {frozenset((solid[joint.parent], solid[joint.child])) for joint in self.joints}
+            first[joint.child] = first[joint.parent] if joint.axis is None else joint.child
+        return first
+
+    @property
+    def joined(self) -> frozenset[frozenset[str]]:
+        """Pairs of links that cannot but touch: they share a joint, where links fixed to each other count as one."""
+        first = self.fixed_to
+        shared = {frozenset((first[joint.parent], first[joint.child])) for joint in self.joints}
         pairs = (frozenset(pair) for pair in itertools.combinations(self.link_names, 2))
-        return frozenset(pair for pair in pairs if frozenset(solid[link] for link in pair) in shared)
+        return frozenset(pair for pair in pairs if frozenset(first[link] for link in pair) in shared)
 
     def joint(self, name: str) -> Joint:
         """The joint of that name."""
@@ -235,15 +241,15 @@ def _inertia(inertial: yourdfpy.Inertial) -> Inertia:
     return Inertia(float(inertial.mass), origin[:3, 3], turn @ np.asarray(inertial.inertia, float) @ turn.T)
 
 
-def _finger(joints: list[str]) -> list[str]:
+def _finger(joints: object) -> list[str]:
     if not isinstance(joints, list):
         raise ValueError(f"joint {joints} stands alone; joints takes a list for each finger, such as [[a, b], [c]]")
     return joints
 
 
-def _vector(values: list[float] | NDArray[np.float64], what: str) -> NDArray[np.float64]:
+def _vector(values: object, what: str) -> NDArray[np.float64]:
     try:
-        vector = np.asarray(values, float)
+        vector = np.array(values, float)
     except (TypeError, ValueError):
         vector = np.empty(0)
     if vector.shape != (3,) or not np.isfinite(vector).all():
@@ -251,7 +257,7 @@ def _vector(values: list[float] | NDArray[np.float64], what: str) -> NDArray[np.
     return vector
 
 
-def _unit(values: list[float] | NDArray[np.float64], what: str) -> NDArray[np.float64]:
+def _unit(values: object, what: str) -> NDArray[np.float64]:
     vector = _vector(values, what)
     if not vector.any():
         raise ValueError(f"{what} is zero, expected a direction")

@@ -58,7 +58,7 @@ class HandPage:
         self._link_names: list[viser.LabelHandle] = []
         self._finger_names: list[viser.LabelHandle] = []
         self._lower, self._upper = hand.reduce(hand.lower).double(), hand.reduce(hand.upper).double()
-        self._random = np.random.default_rng(seed)
+        self._random = torch.Generator().manual_seed(seed)
         self._moving = threading.Lock()  # each event of the page comes on a thread of its own
         fingers = _fingers(hand)
         with self.server.atomic():
@@ -84,9 +84,8 @@ class HandPage:
         self.move(torch.zeros_like(self._lower).clamp(self._lower, self._upper))
 
     def move_randomly(self) -> None:
-        """Draw each joint uniformly within its limits; links may meet."""
-        fraction = torch.from_numpy(self._random.random(len(self._lower)))
-        self.move(self._lower + fraction * (self._upper - self._lower))
+        """Draw a posture within the limits in which the hand does not touch itself."""
+        self.move(self.hand.reduce(self.hand.random(1, self._random)[0]).double())
 
     def stop(self) -> None:
         """Stop serving."""

@@ -19,9 +19,11 @@ def add_hand(world: mujoco.MjSpec, hand: HandSpec) -> None:
     """Add the hand with a free wrist, welded to the mocap body `wrist_target`, and a position servo on each joint.
 
     Bodies, joints and actuators bear the names of the URDF's links and joints. The coupled distal joints follow by an
-    equality constraint and have a servo of their own, whose target is that of the joint they follow: one motor whose
-    torque acts on both through the steel coupling. The hand's weight is carried by the arm (gravity compensation).
+    equality constraint and have a servo of their own, whose target is the coupled angle: one motor whose torque acts on
+    both through the steel coupling. The hand's weight is carried by the arm (gravity compensation).
+    Raises ValueError where the URDF lacks what the differentiable hand can do without: masses and efforts.
     """
+    _check(hand)
     target = world.worldbody.add_body(name="wrist_target", mocap=True)
     palm = world.worldbody.add_body(name=hand.palm)
     palm.add_freejoint(name="wrist")
@@ -79,14 +81,23 @@ def add_hand(world: mujoco.MjSpec, hand: HandSpec) -> None:
     )
 
 
+def _check(hand: HandSpec) -> None:
+    heavy = {hand.fixed_to[link] for link, inertia in hand.inertias.items() if inertia.mass > 0}
+    for link in hand.link_names:
+        if hand.fixed_to[link] not in heavy:
+            raise ValueError(f"link {link} of hand {hand.name} moves without a mass; give it an <inertial> in the URDF")
+    for joint in hand.joints:
+        if joint.axis is not None and joint.effort <= 0:
+            raise ValueError(f"joint {joint.name} of hand {hand.name} has no effort; give its <limit> one in the URDF")
+
+
 def _add_primitive(body: mujoco.MjsBody, primitive: Primitive) -> None:
-    capsule = primitive.radius > 0
     turn = primitive.pose[:3, :3]
-    if capsule:  # MuJoCo's capsules lie along z, ours along x
+    if primitive.is_capsule:  # MuJoCo's capsules lie along z, ours along x
         turn = turn @ np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE if capsule else mujoco.mjtGeom.mjGEOM_BOX,
-        size=[primitive.radius, primitive.half[0], 0] if capsule else primitive.half,
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE if primitive.is_capsule else mujoco.mjtGeom.mjGEOM_BOX,
+        size=[primitive.radius, primitive.half[0], 0] if primitive.is_capsule else primitive.half,
         pos=primitive.pose[:3, 3],
         quat=_quaternion(turn),
         contype=HAND,

@@ -1,0 +1,63 @@
+"""What README and examples show runs as it stands."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dexzoo.cli import main
+from dexzoo.sim import Scene
+from dexzoo.sim.shapes import make_object
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+# These make a grasp set, train or serve until stopped; tests of their own run them small.
+ELSEWHERE = ("collect", "fit", "test", "view")
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the files that README's lines name."""
+    folder = tmp_path_factory.mktemp("desk")
+    obj = make_object("can_05")
+    obj.mesh.export(folder / "mug.obj")
+    observation = Scene.place(obj, seed=0).observe(seed=0)
+    cv2.imwrite(str(folder / "depth.png"), np.round(observation.depth * 10_000).astype(np.uint16))
+    camera = {**observation.camera.__dict__, "depth_scale": 0.0001}
+    (folder / "camera.json").write_text(json.dumps(camera))
+    return folder
+
+
+@pytest.mark.xdist_group("readme")
+def test_the_lines_of_python_in_the_readme_run(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(desk)
+    (block,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    names: dict[str, object] = {}
+    exec(block, names)
+    assert len(names["result"].grasps) == 20  # type: ignore[attr-defined]
+    assert len(names["outcomes"]) > 0  # type: ignore[arg-type]
+
+
+@pytest.mark.xdist_group("readme")
+def test_the_commands_in_the_readme_run(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(desk)
+    lines = re.findall(r"^python -m dexzoo (.*?)(?:\s+#.*)?$", README, re.M)
+    assert len(lines) > 8
+    for line in lines:
+        if not line.startswith(ELSEWHERE):
+            assert main(shlex.split(line)) == 0, line
+    assert (desk / "out" / "plan" / "best_grasp.png").exists()
+    assert (desk / "better.safetensors").exists()
+
+
+def test_the_demo_ranks_verifies_and_draws(tmp_path: Path) -> None:
+    call = [sys.executable, str(ROOT / "examples" / "01_demo.py"), "--num_grasps", "12", "--out", str(tmp_path)]
+    done = subprocess.run(call, capture_output=True, text=True, check=True, timeout=120)
+    assert "verified" in done.stdout and "score before" in done.stdout
+    assert {path.name for path in tmp_path.iterdir()} == {"grasp.png", "lift.png"}
