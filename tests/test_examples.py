@@ -59,5 +59,6 @@ def test_the_commands_in_the_readme_run(desk: Path, monkeypatch: pytest.MonkeyPa
 def test_the_demo_ranks_verifies_and_draws(tmp_path: Path) -> None:
     call = [sys.executable, str(ROOT / "examples" / "01_demo.py"), "--num_grasps", "12", "--out", str(tmp_path)]
     done = subprocess.run(call, capture_output=True, text=True, check=True, timeout=120)
-    assert "verified" in done.stdout and "score before" in done.stdout
+    assert "verified" in done.stdout
+    assert "score before" in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"grasp.png", "lift.png"}

@@ -12,6 +12,7 @@ from dexzoo.camera import Observation
 from dexzoo.grasp import Grasps
 from dexzoo.hand import Hand
 from dexzoo.sim import Outcomes, Scene, trial
+from dexzoo.sim.scene import REFERENCE, WORKING
 from dexzoo.verification import verify
 
 
@@ -129,8 +130,8 @@ def test_a_fall_at_the_end_is_no_success(
     """The hand opens a moment before the end: the object is not yet far, but it falls."""
     commands = trial.trajectory
 
-    def opening(grasps: Grasps, hand: Hand) -> tuple[Any, Any, Any]:
-        wrist, turn, angles = commands(grasps, hand)
+    def opening(grasps: Grasps, hand: Hand, timestep: float) -> tuple[Any, Any, Any]:
+        wrist, turn, angles = commands(grasps, hand, timestep)
         angles[:, -50:] = 0.0
         return wrist, turn, angles
 
@@ -138,6 +139,11 @@ def test_a_fall_at_the_end_is_no_success(
     outcomes = trial.run(can_scene, good[:4], hand)
     assert not outcomes.success.any()
     assert (outcomes.lost_at > trial.LIFT + trial.HOLD - 0.5).all()
+
+
+def test_the_reference_setting_agrees_on_clear_cases(can_scene: Scene, good: Grasps, hand: Hand) -> None:
+    outcomes = trial.run(can_scene, good[:3], hand, physics=REFERENCE)
+    assert outcomes.success.mean() >= 2 / 3
 
 
 def test_a_slippery_object_is_not_held(can_scene: Scene, good: Grasps, hand: Hand) -> None:
@@ -163,6 +169,24 @@ def test_a_diverged_simulation_is_unstable_and_no_success(
     assert outcomes.unstable.tolist() == [True, True, False, False]
     assert outcomes.success.tolist() == [False, False, True, True]
     assert np.isnan(outcomes.shift[:2]).all()
+
+
+def test_a_diverged_trial_is_repeated_at_the_reference_setting(
+    can_scene: Scene, good: Grasps, hand: Hand, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    advance = trial._Execution.advance
+
+    def shaken(self: trial._Execution, ids: np.ndarray, begin: int, end: int) -> None:
+        if begin == 0 and self.batch.model.opt.timestep == WORKING.timestep:
+            self.qpos[0, self.object_at] = np.nan
+        advance(self, ids, begin, end)
+
+    alone = trial.run(can_scene, good[:1], hand, physics=REFERENCE)
+    monkeypatch.setattr(trial._Execution, "advance", shaken)
+    outcomes = trial.run(can_scene, good[:2], hand)
+    assert not outcomes.unstable.any()
+    assert outcomes.success[0] == alone.success[0]
 
 
 # the same however it is run

@@ -14,7 +14,20 @@ from dexzoo.hand import HandSpec
 from dexzoo.sim.objects import ObjectModel
 from dexzoo.sim.robot import HAND, OBJECT, TABLE, add_hand
 
-TIMESTEP = 0.004
+
+@dataclass(frozen=True)
+class Physics:
+    """How finely a trial is simulated. timestep in seconds; stops_early: a trial ends once its object is lost."""
+
+    timestep: float = 0.004
+    noslip_iterations: int = 0
+    stops_early: bool = True
+
+
+WORKING = Physics()
+"""What all labels are made with."""
+REFERENCE = Physics(timestep=0.001, noslip_iterations=5, stops_early=False)
+"""What the labels are compared with."""
 SETTLE_TIME = 4.0
 MIN_PIXELS = 250
 _VISUAL_GROUP = 3
@@ -41,7 +54,7 @@ class Scene:
         Raises ValueError when it does not come to rest near the origin in three tries.
         """
         rng = np.random.default_rng(seed)
-        model = _world(obj).compile()
+        model = _world(obj, WORKING).compile()
         data = mujoco.MjData(model)
         low = obj.mesh.bounds[0][2]
         for _ in range(3):
@@ -55,13 +68,13 @@ class Scene:
             data.qpos[3:] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
             still = 0
             late = data.qpos.copy()
-            for step in range(int(SETTLE_TIME / TIMESTEP)):
+            for step in range(int(SETTLE_TIME / WORKING.timestep)):
                 mujoco.mj_step(model, data)
                 data.qvel[:] *= 0.98  # air, without which a ball would roll for ever
                 still = still + 1 if np.abs(data.qvel).max() < _STILL else 0
                 if still >= 25:
                     break
-                if step == int(0.75 * SETTLE_TIME / TIMESTEP):
+                if step == int(0.75 * SETTLE_TIME / WORKING.timestep):
                     late = data.qpos.copy()
             # what rocks on three points trembles for ever, but stays where it is
             stays = still >= 25 or np.abs(data.qpos - late).max() < _STAYS
@@ -72,9 +85,9 @@ class Scene:
                 return cls(obj, pose)
         raise ValueError(f"object {obj.name} does not come to rest on the table; check its mesh, convex parts and size")
 
-    def model(self, hand: HandSpec) -> mujoco.MjModel:
+    def model(self, hand: HandSpec, physics: Physics = WORKING) -> mujoco.MjModel:
         """The world of a trial: table, object and hand. The object's free joint is `object`, the wrist's `wrist`."""
-        world = _world(self.object)
+        world = _world(self.object, physics)
         add_hand(world, hand)
         return world.compile()
 
@@ -147,12 +160,13 @@ class Scene:
         return depth, normals, geom.reshape(length.shape) == 1
 
 
-def _world(obj: ObjectModel) -> mujoco.MjSpec:
+def _world(obj: ObjectModel, physics: Physics) -> mujoco.MjSpec:
     """Table and object. The object's friction acts on all its contacts, since its geoms have priority."""
     world = mujoco.MjSpec()
     world.compiler.degree = False
     option = world.option
-    option.timestep = TIMESTEP
+    option.timestep = physics.timestep
+    option.noslip_iterations = physics.noslip_iterations
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 10

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from dexzoo import rotation
 from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE, Grasps, pose_matrix
 from dexzoo.hand import Hand
-from dexzoo.sim.scene import TIMESTEP, Scene
+from dexzoo.sim.scene import REFERENCE, WORKING, Physics, Scene
 
 APPROACH_DISTANCE = 0.05
 APPROACH, CLOSE, SQUEEZE_TIME, PAUSE, LIFT, HOLD = 0.2, 0.9, 0.4, 0.1, 2.0, 2.0
 """Seconds: to the pre-grasp, to the grip, to the squeeze, before the lift, up one metre, held there."""
 LIFT_HEIGHT = 1.0
-_CHUNK = 25  # steps between looks at who has lost the object
+_LOOK = 0.1  # seconds between looks at who has lost the object
 _LOST = 0.1  # metres, besides the object's radius, that it may stay behind the hand
 _FALLING = 0.2  # m/s of the object at the end, when the hand stands still
 _BATCH = 256  # trials whose trajectories are in memory at once
@@ -33,7 +33,7 @@ class Outcomes:
 
     success: the object hung in the hand to the end, and the hand did not touch the table on its way to the grip.
     collided: the commanded path to the grip meets the table; such a grasp is not executed.
-    unstable: the solver diverged; not counted as success.
+    unstable: the solver diverged, at the reference setting too; not counted as success.
     shift, rotation: how far the object moved in the hand between the end of the squeeze and the end of the hold, in
     metres and radians; NaN where it was lost. lost_at: seconds after the start of the lift; NaN where it was not.
     success_rate: share of the trials that held; that of one trial is success.
@@ -56,16 +56,26 @@ class Outcomes:
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
-def run(scene: Scene, grasps: Grasps, hand: Hand, num_threads: int = 0) -> Outcomes:
+def run(scene: Scene, grasps: Grasps, hand: Hand, num_threads: int = 0, physics: Physics = WORKING) -> Outcomes:
     """Execute grasps in the world frame, each from the scene's state at rest, many at once.
 
-    num_threads: 0 uses all cores; the outcomes do not depend on it.
+    num_threads: 0 uses all cores; the outcomes do not depend on it. A trial that the solver diverges in is repeated at
+    the reference setting.
     """
     collided = touches_table(grasps, hand)
     free = np.flatnonzero(~collided)
-    model = scene.model(hand.spec)
-    parts = [_run_batch(model, scene, grasps[chunk], hand, num_threads) for chunk in np.array_split(free, _parts(free))]
-    return _scatter(Outcomes.concatenate(parts), free, collided)
+    model = scene.model(hand.spec, physics)
+    parts = [
+        _run_batch(model, scene, grasps[chunk], hand, num_threads, physics)
+        for chunk in np.array_split(free, max(1, -(-len(free) // _BATCH)))
+    ]
+    outcomes = _scatter(Outcomes.concatenate(parts), free, collided)
+    again = np.flatnonzero(outcomes.unstable)
+    if len(again) and physics != REFERENCE:
+        finer = run(scene, grasps[again], hand, num_threads, REFERENCE)
+        for field in fields(Outcomes):
+            getattr(outcomes, field.name)[again] = getattr(finer, field.name)
+    return outcomes
 
 
 def touches_table(grasps: Grasps, hand: Hand, steps: int = 4) -> NDArray[np.bool_]:
@@ -82,13 +92,15 @@ def touches_table(grasps: Grasps, hand: Hand, steps: int = 4) -> NDArray[np.bool
     return np.asarray((low < 0).numpy())
 
 
-def trajectory(grasps: Grasps, hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def trajectory(
+    grasps: Grasps, hand: Hand, timestep: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Commands at every simulation step: wrist position, wrist quaternion (wxyz) and joint targets."""
     position, quaternion, joints = _path(grasps)
     durations = [APPROACH] + [CLOSE / GRIP] * GRIP + [SQUEEZE_TIME / (SQUEEZE - GRIP)] * (SQUEEZE - GRIP)
     times = np.concatenate(([0], np.cumsum(durations)))
     end = times[-1] + PAUSE + LIFT + HOLD
-    steps = np.arange(1, round(end / TIMESTEP) + 1) * TIMESTEP
+    steps = np.arange(1, round(end / timestep) + 1) * timestep
     keys = torch.tensor(np.interp(steps, times, np.arange(len(times))))
     wrist, turn, angles = _interpolate(position, quaternion, joints, keys)
     rise = np.clip((steps - times[-1] - PAUSE) / LIFT, 0, 1)
@@ -96,13 +108,9 @@ def trajectory(grasps: Grasps, hand: Hand) -> tuple[NDArray[np.float64], NDArray
     return wrist.numpy(), turn.numpy(), hand.clamp(angles).numpy()
 
 
-def lift_start() -> int:
+def lift_start(timestep: float) -> int:
     """The step at which the lift begins."""
-    return round((APPROACH + CLOSE + SQUEEZE_TIME + PAUSE) / TIMESTEP)
-
-
-def _parts(free: NDArray[np.int64]) -> int:
-    return max(1, -(-len(free) // _BATCH))
+    return round((APPROACH + CLOSE + SQUEEZE_TIME + PAUSE) / timestep)
 
 
 def _scatter(done: Outcomes, index: NDArray[np.int64], collided: NDArray[np.bool_]) -> Outcomes:
@@ -158,7 +166,7 @@ class _Execution:
     """Many grasps under way on copies of one scene; poses are read from the state of the batch."""
 
     def __init__(self, scene: Scene, grasps: Grasps, hand: Hand, model: mujoco.MjModel, num_threads: int) -> None:
-        self.wrist, self.turn, self.angles = trajectory(grasps, hand)
+        self.wrist, self.turn, self.angles = trajectory(grasps, hand, model.opt.timestep)
         self.num_steps = self.wrist.shape[1]
         self.batch = Batch(model, max(len(grasps), 1), num_threads)
         self.qpos = self.batch.bind("qpos")
@@ -203,7 +211,9 @@ class _Execution:
         return torch.cat((offset, rotation.normalize(rotation.multiply(inverse, pose[:, 3:]))), -1).numpy()
 
 
-def _run_batch(model: mujoco.MjModel, scene: Scene, grasps: Grasps, hand: Hand, num_threads: int) -> Outcomes:
+def _run_batch(
+    model: mujoco.MjModel, scene: Scene, grasps: Grasps, hand: Hand, num_threads: int, physics: Physics
+) -> Outcomes:
     count = len(grasps)
     run = _Execution(scene, grasps, hand, model, num_threads)
     limit = _LOST + scene.object.radius
@@ -212,8 +222,8 @@ def _run_batch(model: mujoco.MjModel, scene: Scene, grasps: Grasps, hand: Hand, 
     lost_at = np.full(count, np.nan, np.float32)
     gripped = np.full((count, 7), np.nan)
     rest_height = run.object_center(np.zeros(1, np.int64))[0, 2]
-    lifted = lift_start()
-    stops = sorted({*range(0, run.num_steps, _CHUNK), lifted, run.num_steps})
+    lifted = lift_start(physics.timestep)
+    stops = sorted({*range(0, run.num_steps, round(_LOOK / physics.timestep)), lifted, run.num_steps})
     for begin, end in pairwise(stops):
         if not len(alive):
             break
@@ -226,8 +236,9 @@ def _run_batch(model: mujoco.MjModel, scene: Scene, grasps: Grasps, hand: Hand, 
         if end >= lifted:
             rise = run.wrist[alive, end - 1, 2] - run.wrist[alive, lifted - 1, 2]
             away |= rise - (center[:, 2] - rest_height) > limit
-        lost_at[alive[away]] = (end - lifted) * TIMESTEP
-        alive = alive[~away]
+        if physics.stops_early or end == run.num_steps:
+            lost_at[alive[away]] = (end - lifted) * physics.timestep
+            alive = alive[~away]
         if end == lifted:
             gripped[alive] = run.in_palm(alive)
     speed = np.linalg.norm(run.qvel[alive, run.object_dof : run.object_dof + 3], axis=1)
@@ -258,7 +269,7 @@ def replay(scene: Scene, grasp: Grasps, hand: Hand, seconds: list[float]) -> lis
     only = np.zeros(1, np.int64)
     moments, begin = [], 0
     for time in seconds:
-        end = min(max(lift_start() + round(time / TIMESTEP), begin + 1), run.num_steps)
+        end = min(max(lift_start(WORKING.timestep) + round(time / WORKING.timestep), begin + 1), run.num_steps)
         run.advance(only, begin, end)
         begin = end
         state = torch.tensor(run.qpos[0])
