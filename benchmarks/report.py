@@ -78,7 +78,7 @@ def counts() -> str:
 
 
 def page() -> str:
-    em2, refine, meshes = read("em2"), read("refine"), read("meshes")
+    em2, refine, simulator, meshes = read("em2"), read("refine"), read("simulator"), read("meshes")
     parts = [
         "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
         "bootstrap over scenes.\n",
@@ -135,6 +135,15 @@ def page() -> str:
                 for name, row in refine["groups"].items()
             ],
         ),
+        f"## Labels\n\n`benchmarks/simulator.py`; {simulator['grasps']} grasps of the set, half of them such as hold, executed "
+        "again. What disagrees with itself when the wrist moves by a tenth of a millimetre is the ceiling of any "
+        "evaluator's accuracy.\n",
+        table(
+            ("compared with the working setting", "labels that agree"),
+            [(name, percent(rate)) for name, rate in simulator["agreement_with_working"].items()],
+        ),
+        f"Trials a second on a loaded machine: {simulator['trials_per_second']['working']:.1f} at the working setting, "
+        f"{simulator['trials_per_second']['reference']:.1f} at the reference.\n",
         f"## Meshes from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no part of "
         "dexzoo, 50 grasps each from one view, 0.2 kg, friction 0.7. At least one grasp holds for "
         f"{meshes['objects_with_a_grasp_that_holds']} of {len(meshes['objects'])}.\n",
