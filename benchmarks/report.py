@@ -135,9 +135,9 @@ def page() -> str:
                 for name, row in refine["groups"].items()
             ],
         ),
-        f"## Labels\n\n`benchmarks/simulator.py`; {simulator['grasps']} grasps of the set, half of them such as hold, executed "
-        "again. What disagrees with itself when the wrist moves by a tenth of a millimetre is the ceiling of any "
-        "evaluator's accuracy.\n",
+        f"## Labels\n\n`benchmarks/simulator.py`; {simulator['grasps']} grasps of the set, half of them such as hold, "
+        "executed again. What disagrees with itself when the wrist moves by a tenth of a millimetre is the ceiling of "
+        "any evaluator's accuracy.\n",
         table(
             ("compared with the working setting", "labels that agree"),
             [(name, percent(rate)) for name, rate in simulator["agreement_with_working"].items()],

@@ -87,7 +87,7 @@ def test_point_distances_pass_gradcheck() -> None:
 
 def test_slopes_where_there_is_a_kink() -> None:
     capsule, box = torch.tensor([[0.02], [0], [0]]).double(), torch.tensor([[0.03], [0.02], [0.01]]).double()
-    on_axis = box_slope(torch.tensor([[0.01, 0.02], [0, 0], [0, 0]], dtype=torch.float64), capsule)
+    on_axis = box_slope(torch.tensor([[0.01, -0.01], [0, 0], [0, 0]], dtype=torch.float64), capsule)
     torch.testing.assert_close(on_axis, torch.zeros(3, 2, dtype=torch.float64))
     points = torch.tensor([[0, 0.03, 0.025], [0, 0, 0.015], [0, 0, 0]], dtype=torch.float64)
     slopes = box_slope(points, box)  # at the centre, on a face, and as deep below one face as below another
