@@ -11,7 +11,7 @@ from torch.autograd import gradcheck
 
 from dexzoo import rotation
 from dexzoo.camera import Camera
-from dexzoo.grasp import GRIP, NUM_TYPES, PREGRASP, SQUEEZE, Grasps, pose_matrix, transform_waypoints
+from dexzoo.grasp import GRIP, NUM_TYPES, PREGRASP, SQUEEZE, Grasps, pose_matrix, step_pose, transform_waypoints
 from dexzoo.hand import default_hand
 
 
@@ -258,3 +258,17 @@ def test_a_pickle_is_refused_unread(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="is not a safetensors file of grasps"):
             Grasps.load(path)
     assert not trace.exists()
+
+
+def test_a_pose_steps_in_its_own_frame_and_stays_in_its_box() -> None:
+    pose = pose_matrix(
+        torch.tensor([0.1, 0.2, 0.3]), rotation.from_axis_angle(torch.tensor([0.0, 0, 1]), torch.tensor(0.5))
+    )
+    ahead = step_pose(pose, torch.tensor([0.01, 0, 0, 0, 0, 0.2]))
+    assert torch.allclose(ahead[:3, 3] - pose[:3, 3], 0.01 * pose[:3, 0], atol=1e-6)
+    turn = rotation.log(rotation.from_matrix(pose[:3, :3].T @ ahead[:3, :3]))
+    assert torch.allclose(turn, torch.tensor([0.0, 0, 0.2]), atol=1e-5)
+    box = torch.tensor([0.005] * 3 + [0.05] * 3)
+    far = torch.linalg.inv(pose) @ step_pose(pose, torch.full((6,), 9.0), box)
+    assert (far[:3, 3].abs() <= 0.005 + 1e-6).all()
+    assert torch.allclose(step_pose(pose, 1e-5 * torch.ones(6), box), step_pose(pose, 1e-5 * torch.ones(6)), atol=1e-7)

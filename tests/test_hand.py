@@ -187,6 +187,28 @@ def test_thumb_opposes(hand: Hand, finger: str) -> None:
     assert gap < 1e-3
 
 
+@pytest.mark.parametrize("finger", ["index", "middle"])
+def test_pads_face_each_other(hand: Hand, finger: str) -> None:
+    """Pads 20 mm apart within 25 degrees of the line that joins them, as a friction cone of 0.5 asks for."""
+    pair = [hand.pad_names.index("thumb"), hand.pad_names.index(finger)]
+    free = 2 * torch.randn(128, 15, generator=torch.Generator().manual_seed(0))
+    optimizer = torch.optim.Adam([free.requires_grad_()], lr=0.1)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 800)
+    for _ in range(800):
+        points, normals = hand.pads(hand.forward_kinematics(hand.expand(hand.squash(free))))
+        line = points[:, pair[1]] - points[:, pair[0]]
+        gap = line.norm(dim=-1)
+        cosine = ((normals[:, pair] * torch.stack((line, -line), 1)).sum(-1) / gap[:, None]).amin(-1)
+        loss = ((gap - 0.02) / 0.002).square() - 300 * cosine
+        optimizer.zero_grad()
+        loss.sum().backward()
+        optimizer.step()
+        schedule.step()
+    angle = torch.rad2deg(torch.acos(cosine.detach().clamp(-1, 1)))
+    best = angle[(gap - 0.02).abs() < 1e-3].min()
+    assert best < 25
+
+
 # --- the left hand ---------------------------------------------------------------------------------------------------
 
 
