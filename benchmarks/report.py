@@ -79,6 +79,7 @@ def counts() -> str:
 
 def page() -> str:
     em2, refine, simulator, meshes = read("em2"), read("refine"), read("simulator"), read("meshes")
+    kinematics = read("kinematics")
     parts = [
         "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
         "bootstrap over scenes.\n",
@@ -144,6 +145,30 @@ def page() -> str:
         ),
         f"Trials a second on a loaded machine: {simulator['trials_per_second']['working']:.1f} at the working setting, "
         f"{simulator['trials_per_second']['reference']:.1f} at the reference.\n",
+        f"## The hand\n\n`benchmarks/kinematics.py`, {kinematics['threads']} threads; all links of "
+        f"{kinematics['kinematics']['batch']:,} postures, against pytorch_kinematics "
+        f"{kinematics['pytorch_kinematics']} in the same run.\n",
+        table(
+            ("postures a second", "dexzoo", "pytorch_kinematics", "ratio"),
+            [
+                (
+                    name.replace("_", " "),
+                    f"{row['ours']:,}",
+                    f"{row['pytorch_kinematics']:,}",
+                    kinematics["kinematics"]["ratio"][name],
+                )
+                for name, row in kinematics["kinematics"]["postures_per_second"].items()
+            ],
+        ),
+        f"Distances of {kinematics['distances']['grasps']} grasps x {kinematics['distances']['waypoints']} waypoints to "
+        f"{kinematics['distances']['points']:,} points, each other and the table:\n",
+        table(
+            ("seconds", "forward", "with gradient"),
+            [
+                (name.replace("_", " "), row["forward"], row["forward_and_backward"])
+                for name, row in kinematics["distances"]["seconds"].items()
+            ],
+        ),
         f"## Meshes from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no part of "
         "dexzoo, 50 grasps each from one view, 0.2 kg, friction 0.7. At least one grasp holds for "
         f"{meshes['objects_with_a_grasp_that_holds']} of {len(meshes['objects'])}.\n",

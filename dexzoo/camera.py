@@ -15,6 +15,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dexzoo import rotation
+
 MAX_DEPTH = 1.4
 """Readings beyond this many metres count as none (the range of the thesis' sensor)."""
 IMAGE_SIZE = 224
@@ -94,8 +96,9 @@ class Observation:
     ) -> None:
         self.camera = camera
         self.depth = _check_depth(depth, camera)
+        self.T_world_camera: NDArray[np.float64]
         if T_world_camera is not None:
-            self.T_world_camera = _check_pose(T_world_camera)
+            self.T_world_camera = rotation.check_pose(T_world_camera, "T_world_camera").numpy()
         else:
             plane = fit_table(self.depth, camera) if table is None else _check_table(table)
             self.T_world_camera = _pose_over_table(plane)
@@ -116,7 +119,7 @@ class Observation:
         pose = config.get("T_world_camera")
         plane = config.get("table_plane")
         try:
-            pose = None if pose is None else _check_pose(np.array(pose, np.float64))
+            pose = None if pose is None else rotation.check_pose(pose, "T_world_camera").numpy()
             table = None if plane is None else _check_table(np.array([*plane["normal"], plane["offset"]], np.float64))
         except (KeyError, TypeError):
             raise ValueError(
@@ -331,16 +334,6 @@ def _check_depth(depth: NDArray[Any], camera: Camera) -> NDArray[np.float32]:
             "or a depth_scale in the camera file"
         )
     return image
-
-
-def _check_pose(pose: NDArray[Any]) -> NDArray[np.float64]:
-    T = np.asarray(pose, np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise ValueError(f"T_world_camera must be a finite 4 x 4 matrix, got shape {T.shape}")
-    turn = T[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
-        raise ValueError("T_world_camera's rotation is not orthonormal and right-handed")
-    return T
 
 
 def _check_table(table: NDArray[Any]) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from dexzoo.hand_spec import Primitive
 
-_CHUNK = 2**18  # coordinates handled at once, so that they stay in cache
+_CHUNK = 2**19  # coordinates handled at once, so that they stay in cache
 _HALVINGS = {torch.float32: 18, torch.float64: 42}
 """Of a segment in search of its nearest point; with more, rounding would hide on which face either end lies."""
 

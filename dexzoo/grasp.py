@@ -171,9 +171,7 @@ class Grasps:
         """The same grasps in "world" or "camera", given the pose of the camera in the world, (4, 4)."""
         if frame == self.frame:
             return self
-        T = torch.as_tensor(T_world_camera, dtype=torch.float64)
-        if T.shape != (4, 4):
-            raise ValueError(f"T_world_camera has shape {tuple(T.shape)}, expected (4, 4)")
+        T = rotation.check_pose(T_world_camera, "T_world_camera")
         if frame == "camera":
             T = torch.linalg.inv(T)
         return replace(self, waypoints=transform_waypoints(T.to(self.waypoints), self.waypoints), frame=frame)

@@ -227,7 +227,8 @@ class Hand(nn.Module):
         """Distance in metres from points to the surface of each solid link, negative inside.
 
         links: link poses in the frame of the points. points broadcast against the poses. Exact for capsules and
-        boxes; where several primitives make one link, the nearest counts.
+        boxes; where several primitives make one link, the nearest counts, so a point in two of them may lie deeper.
+        Differentiable once.
         """
         constants = self._cast(links)
         poses = self.shape_poses(links)

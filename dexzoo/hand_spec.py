@@ -120,7 +120,7 @@ class HandSpec:
             urdf = _read_urdf(folder / config["urdf"])
             joints = _tree_order(config["palm"], [_joint(joint) for joint in urdf.joints])
             spec = cls(
-                name=folder.name,
+                name=folder.resolve().name,
                 side=config["side"],
                 palm=config["palm"],
                 joints=joints,
@@ -150,7 +150,7 @@ class HandSpec:
         if side != spec.side:
             if "mirror" not in config:
                 raise ValueError(
-                    f'hand {folder.name} has no {side} side: {path} has no entry mirror; use side="{spec.side}"'
+                    f'hand {spec.name} has no {side} side: {path} has no entry mirror; use side="{spec.side}"'
                 )
             _check_links(spec, path, config["mirror"])
             spec = _mirrored(spec, side, config["mirror"])
@@ -216,7 +216,8 @@ def _joint(joint: yourdfpy.Joint) -> Joint:
     moves = joint.type in ("revolute", "continuous")
     if not moves and joint.type != "fixed":
         raise ValueError(f"joint {joint.name} is {joint.type}; only revolute and fixed joints are supported")
-    limit, mimic, dynamics = joint.limit, joint.mimic, joint.dynamics
+    limit, dynamics = joint.limit, joint.dynamics
+    mimic = joint.mimic if moves else None
     if moves and limit is None:
         raise ValueError(f"joint {joint.name} has no <limit>")
     return Joint(

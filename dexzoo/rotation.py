@@ -13,6 +13,17 @@ from torch import Tensor
 _TINY = 1e-12
 
 
+def check_pose(pose: object, name: str) -> Float[Tensor, "4 4"]:
+    """A pose as a float64 tensor; ValueError that says what `name` is where it is no rigid motion."""
+    T = torch.as_tensor(pose, dtype=torch.float64)
+    if T.shape != (4, 4) or not torch.isfinite(T).all():
+        raise ValueError(f"{name} must be a finite 4 x 4 matrix, got shape {tuple(T.shape)}")
+    turn = T[:3, :3]
+    if (turn @ turn.T - torch.eye(3).to(T)).abs().max() > 1e-3 or torch.linalg.det(turn) < 0:
+        raise ValueError(f"{name}'s rotation is not orthonormal and right-handed")
+    return T
+
+
 def normalize(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """Scale to unit length and choose the sign with w >= 0."""
     unit = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(_TINY)

@@ -55,7 +55,7 @@ def random_points(*shape: int) -> torch.Tensor:
     return torch.rand(*shape, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.1 - 0.05
 
 
-@pytest.mark.parametrize("chunk", [2**18, 100], ids=["all at once", "one by one"])
+@pytest.mark.parametrize("chunk", [2**19, 100], ids=["all at once", "one by one"])
 @pytest.mark.parametrize("each", [False, True], ids=["one cloud", "a cloud for each"])
 def test_point_distances_and_their_gradients_are_those_of_autograd(
     each: bool, chunk: int, monkeypatch: pytest.MonkeyPatch

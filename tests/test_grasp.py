@@ -208,8 +208,11 @@ def test_errors_name_the_grasp_at_fault(grasps: Grasps) -> None:
             Grasps(broken(grasps, (2, slice(None), 27), value), "world")
     with pytest.raises(ValueError, match=r"log_likelihood has shape \(5,\), expected \(6,\)"):
         Grasps(grasps.waypoints, "world", torch.zeros(5))
-    with pytest.raises(ValueError, match=r"T_world_camera has shape \(3, 4\)"):
+    with pytest.raises(ValueError, match=r"T_world_camera must be a finite 4 x 4 matrix, got shape \(3, 4\)"):
         grasps.to_frame("camera", np.eye(4)[:3])
+    for turn in (2 * np.eye(4), np.diag([1.0, 1, -1, 1])):
+        with pytest.raises(ValueError, match="T_world_camera's rotation is not orthonormal and right-handed"):
+            grasps.to_frame("camera", turn)
 
 
 def test_save_and_load(grasps: Grasps, tmp_path: Path) -> None:

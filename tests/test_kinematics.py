@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
+from dexzoo.camera import Camera, Observation
 from dexzoo.hand import Hand, HandSpec, Joint
 from dexzoo.kinematics import KinematicTree, LinkPoses
 
@@ -349,3 +350,13 @@ def test_an_angle_beyond_its_limit_is_named(hand: Hand) -> None:
         hand.check(q)
     hand.check(q.clamp_min(-5e-4))  # rounding is no error
     hand.check(q[:0])
+
+
+@pytest.mark.parametrize("turn", [1.01 * np.eye(3), np.diag([1.0, 1, -1]), np.full((3, 3), np.nan)])
+def test_a_pose_that_is_no_rotation_is_refused(turn: np.ndarray) -> None:
+    pose = np.eye(4)
+    pose[:3, :3] = turn
+    with pytest.raises(
+        ValueError, match=r"T_world_camera('s rotation is not orthonormal| must be a finite 4 x 4 matrix)"
+    ):
+        Observation(np.ones((480, 640), np.float32), Camera(), pose)

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from dexzoo import rotation
 from dexzoo.camera import MAX_DEPTH, Camera, Observation, add_sensor_noise
 from dexzoo.hand import HandSpec
 from dexzoo.sim.objects import ObjectModel
@@ -126,7 +127,10 @@ class Scene:
         """
         rng = np.random.default_rng(seed)
         camera = camera or Camera()
-        pose = _draw_pose(rng, self._center()) if T_world_camera is None else np.asarray(T_world_camera, np.float64)
+        if T_world_camera is None:
+            pose = _draw_pose(rng, self._center())
+        else:
+            pose = rotation.check_pose(T_world_camera, "T_world_camera").numpy()
         depth, normals, on_object = self._cast(camera, pose)
         if on_object.sum() < MIN_PIXELS:
             raise ValueError(f"object {self.object.name} covers {on_object.sum()} pixels, fewer than {MIN_PIXELS}")
