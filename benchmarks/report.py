@@ -160,8 +160,8 @@ def page() -> str:
                 for name, row in kinematics["kinematics"]["postures_per_second"].items()
             ],
         ),
-        f"Distances of {kinematics['distances']['grasps']} grasps x {kinematics['distances']['waypoints']} waypoints to "
-        f"{kinematics['distances']['points']:,} points, each other and the table:\n",
+        f"Distances of {kinematics['distances']['grasps']} grasps x {kinematics['distances']['waypoints']} waypoints "
+        f"to {kinematics['distances']['points']:,} points, each other and the table:\n",
         table(
             ("seconds", "forward", "with gradient"),
             [
