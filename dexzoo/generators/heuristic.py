@@ -26,6 +26,8 @@ MAX_WIDTH = 0.085
 MAX_PENETRATION = 0.002
 MIN_CLEARANCE = 0.002
 STANDOFF = 0.09
+MAX_REACH = 0.24
+"""Metres that the wrist may be from the nearest observed point at the pre-grasp; the stand-off is shortened for it."""
 SQUEEZE = 0.35
 """Radians that mcp and pip go on from the grip to the squeeze."""
 _LEVELS = 12
@@ -94,7 +96,8 @@ class HeuristicGenerator(GraspGenerator):
         rng = np.random.default_rng(seed)
         cloud, normals = complete(observation, rng)
         position, quaternion, shape = self._sample(cloud, normals, rng)
-        grasps, score = self._close(cloud, normals, position, quaternion, shape)
+        observed = observation.points_world[:: max(1, len(observation.points_world) // 500)]
+        grasps, score = self._close(cloud, normals, observed, position, quaternion, shape)
         if not len(grasps):
             raise RuntimeError("no feasible grasp is found: the object may be too large, too flat or out of reach")
         order = spread(grasps, score, num_grasps)
@@ -150,6 +153,7 @@ class HeuristicGenerator(GraspGenerator):
         self,
         cloud: NDArray[np.float32],
         normals: NDArray[np.float32],
+        observed: NDArray[np.float32],
         position: Tensor,
         quaternion: Tensor,
         shape: NDArray[np.int64],
@@ -184,7 +188,11 @@ class HeuristicGenerator(GraspGenerator):
             reach = (points.mean(0) - wrist[:, :3, 3]).norm(dim=-1)
             good = (score > 0) & (clear > MIN_CLEARANCE) & (reach < 0.25)
             if good.any():
-                kept.append(self._path(wrist[good], opened[preshape[good]], grip[good], contact[good], preshape[good]))
+                far = torch.cdist(wrist[good, :3, 3], torch.tensor(observed)).amin(-1)
+                standoff = (MAX_REACH - far).clamp(0.0, STANDOFF)
+                kept.append(
+                    self._path(wrist[good], opened[preshape[good]], grip[good], contact[good], preshape[good], standoff)
+                )
                 scores.append(score[good])
         if not kept:
             return Grasps(torch.zeros(0, 10, 28), "world"), torch.zeros(0)
@@ -228,11 +236,13 @@ class HeuristicGenerator(GraspGenerator):
             touched[:, index] = nearest[rows, first, solid]
         return grip, touched, contact
 
-    def _path(self, wrist: Tensor, opened: Tensor, grip: Tensor, contact: Tensor, preshape: Tensor) -> Grasps:
+    def _path(
+        self, wrist: Tensor, opened: Tensor, grip: Tensor, contact: Tensor, preshape: Tensor, standoff: Tensor
+    ) -> Grasps:
         """Pre-grasp drawn back along the fingers and the palm, grip, squeeze with the fingers that touch."""
         hand = self.hand
         quaternion = rotation.from_matrix(wrist[:, :3, :3])
-        back = torch.nn.functional.normalize(torch.tensor([-0.5, 0.0, -1.0]), dim=0) * STANDOFF
+        back = torch.nn.functional.normalize(torch.tensor([-0.5, 0.0, -1.0]), dim=0) * standoff[:, None]
         pregrasp = wrist[:, :3, 3] + rotation.rotate(quaternion, back)
         pregrasp[:, 2] = torch.maximum(pregrasp[:, 2], wrist[:, 2, 3])
         position = torch.stack((pregrasp, wrist[:, :3, 3], wrist[:, :3, 3]), 1)
