@@ -2,6 +2,7 @@
 
 import json
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -62,3 +63,11 @@ def test_the_demo_ranks_verifies_and_draws(tmp_path: Path) -> None:
     assert "verified" in done.stdout
     assert "score before" in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"grasp.png", "lift.png"}
+
+
+def test_the_figures_are_those_that_the_benchmarks_wrote() -> None:
+    report = runpy.run_path(str(ROOT / "benchmarks" / "report.py"))
+    assert report["with_figures"](README, report["summary"]()) == README
+    card = (ROOT / "docs" / "data.md").read_text()
+    assert report["with_figures"](card, report["counts"]()) == card
+    assert (ROOT / "docs" / "results.md").read_text() == report["page"]()
