@@ -21,7 +21,7 @@ from dexzoo import plots, training
 from dexzoo.camera import Observation
 from dexzoo.data.collect import collect
 from dexzoo.data.schema import merge
-from dexzoo.grasp import GRASP_TYPES, GRIP, PREGRASP, SQUEEZE, Grasps
+from dexzoo.grasp import GRASP_TYPES, GRIP, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.models.zoo import list_models, model_class, shipped_card
 from dexzoo.planning import Plan, plan
@@ -154,7 +154,7 @@ def _plan(options: Namespace) -> Result:
         result = plan(observation, options.evaluator, options.num_grasps, 20 if options.refine else 0, options.seed)
     rows = _plan_rows(result)
     if options.out is not None:
-        picture = best_grasp_picture(observation, result.grasps)
+        picture = plots.grasp_picture(observation, default_hand(), result.grasps[0])
         options.out.mkdir(parents=True, exist_ok=True)
         result.grasps.save(options.out / "grasps.safetensors")
         summary = {"frame": "camera", "T_world_camera": observation.T_world_camera.tolist(), "grasps": rows}
@@ -197,16 +197,6 @@ def _plan_rows(result: Plan) -> list[dict[str, Any]]:
         }
         for rank, (kind, place, score, refined, palm) in enumerate(parts, 1)
     ]
-
-
-def best_grasp_picture(observation: Observation, grasps: Grasps) -> plots.Image:
-    """The depth image around the object, with the first grasp's hand at pre-grasp, grip and squeeze."""
-    hand = default_hand()
-    moments = {"pre-grasp": PREGRASP, "grip": GRIP, "squeeze": SQUEEZE}
-    best = grasps[0].to_frame("world", observation.T_world_camera)
-    aimed = observation.aimed(460)
-    pictures = [plots.overlay_hand(aimed, hand, best, waypoint) for waypoint in moments.values()]
-    return plots.grid(pictures, list(moments), columns=3)
 
 
 def _refine(options: Namespace) -> Result:

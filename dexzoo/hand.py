@@ -33,6 +33,7 @@ class _Constants(NamedTuple):
     shape_pose: Tensor
     shape_half: Tensor
     shape_radius: Tensor
+    pads: Tensor  # (2, pad, 3): points and normals
 
 
 class Hand(nn.Module):
@@ -60,6 +61,10 @@ class Hand(nn.Module):
         self.register_buffer("upper", torch.tensor([joint.upper for joint in joints], dtype=torch.float32))
         self._prepare_coupling(joints)
         self._prepare_shapes()
+        pads = [spec.pads[name] for name in self.pad_names]
+        self._pad_link = [self.link_index(pad.link) for pad in pads]
+        points_and_normals = np.array([[pad.point for pad in pads], [pad.normal for pad in pads]])
+        self._pads = torch.tensor(points_and_normals.reshape(2, len(pads), 3))
         self._constants: dict[tuple[torch.device, torch.dtype], _Constants] = {}
 
     @classmethod
@@ -100,7 +105,8 @@ class Hand(nn.Module):
         """Every constant in the dtype and on the device of a tensor, kept for the next call."""
         key = (like.device, like.dtype)
         if key not in self._constants:
-            values = (self._expand, self._expand_offset, self._shape_pose, self._shape_half, self._shape_radius)
+            shapes = (self._shape_pose, self._shape_half, self._shape_radius)
+            values = (self._expand, self._expand_offset, *shapes, self._pads)
             with torch.inference_mode(False):  # else a first call in inference mode would bar gradients from then on
                 tree = KinematicTree(self.spec, like.dtype, like.device)
                 self._constants[key] = _Constants(tree, *(value.to(*key) for value in values))
@@ -211,11 +217,9 @@ class Hand(nn.Module):
 
     def pads(self, links: Float[Tensor, "*batch link 4 4"]) -> tuple[Tensor, Tensor]:
         """Where the fingertips touch: points and outward normals, each (*batch, pad, 3), in the order `pad_names`."""
-        poses = links[..., [self.link_index(self.spec.pads[name].link) for name in self.pad_names], :, :]
-        point = torch.tensor(np.stack([self.spec.pads[name].point for name in self.pad_names])).to(links)
-        normal = torch.tensor(np.stack([self.spec.pads[name].normal for name in self.pad_names])).to(links)
-        turn = poses[..., :3, :3]
-        return (turn @ point[..., None]).squeeze(-1) + poses[..., :3, 3], (turn @ normal[..., None]).squeeze(-1)
+        poses = links[..., self._pad_link, :, :]
+        turn, pads = poses[..., :3, :3], self._cast(links).pads[..., None]
+        return (turn @ pads[0]).squeeze(-1) + poses[..., :3, 3], (turn @ pads[1]).squeeze(-1)
 
     def shape_poses(self, links: Float[Tensor, "*batch link 4 4"]) -> Float[Tensor, "*batch shape 4 4"]:
         """Poses of the primitives, given those of the links."""

@@ -13,7 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from dexzoo.camera import Camera, Observation
-from dexzoo.grasp import JOINTS, Grasps, pose_matrix
+from dexzoo.grasp import GRIP, JOINTS, PREGRASP, SQUEEZE, Grasps, pose_matrix
 from dexzoo.hand import Hand
 
 Image = NDArray[np.uint8]
@@ -102,6 +102,15 @@ def overlay_hand(observation: Observation, hand: Hand, grasp: Grasps, waypoint: 
     behind = seen & (observation.depth > 0) & (depth > observation.depth + 0.005)
     alpha = np.where(behind, 0.25, 0.85)[..., None] * seen[..., None]
     return np.asarray((1 - alpha) * picture + alpha * drawn, np.uint8)
+
+
+def grasp_picture(observation: Observation, hand: Hand, grasp: Grasps) -> Image:
+    """The depth image around the object, with the hand of one grasp at pre-grasp, grip and squeeze."""
+    moments = {"pre-grasp": PREGRASP, "grip": GRIP, "squeeze": SQUEEZE}
+    world = grasp.to_frame("world", observation.T_world_camera)
+    aimed = observation.aimed(460)
+    pictures = [overlay_hand(aimed, hand, world, waypoint) for waypoint in moments.values()]
+    return grid(pictures, list(moments), columns=3)
 
 
 def look_at(target: NDArray[np.float64], distance: float, azimuth: float, elevation: float) -> NDArray[np.float64]:

@@ -12,7 +12,6 @@ from rich.table import Table
 
 import dexzoo
 from dexzoo import plots
-from dexzoo.cli import best_grasp_picture
 from dexzoo.grasp import GRASP_TYPES
 from dexzoo.hand import default_hand
 from dexzoo.sim import trial
@@ -51,7 +50,7 @@ def main() -> None:
     console.print(f"Of all {len(plan.grasps)} grasps {int(outcomes.success.sum())} hold.")
 
     best = int(np.flatnonzero(outcomes.success)[0]) if outcomes.success.any() else 0
-    plots.save(best_grasp_picture(observation, plan.grasps[best]), options.out / "grasp.png")
+    plots.save(plots.grasp_picture(observation, default_hand(), plan.grasps[best]), options.out / "grasp.png")
     plots.save(
         lift_picture(scene, plan.grasps[best].to_frame("world", observation.T_world_camera)), options.out / "lift.png"
     )

@@ -43,8 +43,9 @@ def collect(folder: Path, num_scenes: int, workers: int = 1, seed: int = 0) -> I
     folder.mkdir(parents=True, exist_ok=True)
     for unfinished in folder.glob(".scene_*"):  # of a run that was killed
         shutil.rmtree(unfinished)
-    missing = [i for i in range(num_scenes) if not (folder / f"scene_{i:06d}").exists()]
-    yield from (f"scene {i} is there already" for i in range(num_scenes) if i not in set(missing))
+    there = {i for i in range(num_scenes) if (folder / f"scene_{i:06d}").exists()}
+    missing = [i for i in range(num_scenes) if i not in there]
+    yield from (f"scene {i} is there already" for i in sorted(there))
     if workers == 1:
         for index in missing:
             yield collect_scene(folder, seed, index)

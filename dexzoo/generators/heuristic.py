@@ -85,6 +85,7 @@ class HeuristicGenerator(GraspGenerator):
     def __init__(self, num_samples: int = 3000) -> None:
         self.num_samples = num_samples
         self.hand: Hand = default_hand()
+        self.fingers = list(dict.fromkeys(name.split("_")[0] for name in self.hand.freedoms))
 
     def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
         """Up to `num_grasps` grasps in the camera frame, those with the best opposition first.
@@ -165,7 +166,6 @@ class HeuristicGenerator(GraspGenerator):
         table = torch.tensor([0.0, 0, 1, 0])
         kept: list[Grasps] = []
         scores: list[Tensor] = []
-        solid_finger = [_finger_of(name, hand) for name in hand.solid_names]
         levels = torch.linspace(0, 1, _LEVELS)
         for start in range(0, len(position), _CHUNK):
             chunk = slice(start, start + _CHUNK)
@@ -181,7 +181,7 @@ class HeuristicGenerator(GraspGenerator):
             posture = opened[preshape, None] + levels[:, None] * (closed - opened)[preshape, None]
             links = wrist[:, None, None] @ hand.forward_kinematics(hand.expand(posture))
             distance, nearest = hand.signed_distance(links, points).min(-1)  # (grasp, level, solid)
-            grip, touched, contact = self._stop(posture, distance, nearest, solid_finger, preshape)
+            grip, touched, contact = self._stop(posture, distance, nearest, preshape)
             score = _opposition(points, torch.tensor(normals), touched, contact)
             links = wrist[:, None] @ hand.forward_kinematics(hand.expand(grip))
             clear = hand.clearance(links, table).amin(-1)
@@ -214,17 +214,16 @@ class HeuristicGenerator(GraspGenerator):
         return torch.tensor(angles)
 
     def _stop(
-        self, posture: Tensor, distance: Tensor, nearest: Tensor, solid_finger: list[int], preshape: Tensor
+        self, posture: Tensor, distance: Tensor, nearest: Tensor, preshape: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Each finger's posture where it first touches, the cloud point it touches, and whether it does."""
         count = len(posture)
         grip = posture[:, -1].clone()
         touched = torch.zeros(count, 5, dtype=torch.long)
         contact = torch.zeros(count, 5, dtype=torch.bool)
-        fingers = list(dict.fromkeys(name.split("_")[0] for name in self.hand.freedoms))
         rows = torch.arange(count)
-        for index, finger in enumerate(fingers):
-            solids = [i for i, f in enumerate(solid_finger) if f == index]
+        for index, finger in enumerate(self.fingers):
+            solids = [i for i, name in enumerate(self.hand.solid_names) if name.startswith(finger)]
             gap, which = distance[:, :, solids].min(-1)
             hit = gap < 0.001
             first = torch.where(hit.any(1), hit.int().argmax(1), _LEVELS - 1)
@@ -246,7 +245,7 @@ class HeuristicGenerator(GraspGenerator):
         pregrasp = wrist[:, :3, 3] + rotation.rotate(quaternion, back)
         pregrasp[:, 2] = torch.maximum(pregrasp[:, 2], wrist[:, 2, 3])
         position = torch.stack((pregrasp, wrist[:, :3, 3], wrist[:, :3, 3]), 1)
-        finger = [("thumb", "index", "middle", "ring", "little").index(name.split("_")[0]) for name in hand.freedoms]
+        finger = [self.fingers.index(name.split("_")[0]) for name in hand.freedoms]
         flexes = torch.tensor([not name.endswith("_abd") for name in hand.freedoms])
         press = SQUEEZE * (contact[:, finger] & flexes)
         squeeze = hand.clamp(grip + press)
@@ -336,12 +335,6 @@ def _extent(
     first_after = np.where(broken & (columns >= zero[:, None]), columns, step.shape[1]).min(1)
     rows = np.arange(len(ordered))
     return ordered[rows, last_before], ordered[rows, first_after]
-
-
-def _finger_of(link: str, hand: Hand) -> int:
-    fingers = list(dict.fromkeys(name.split("_")[0] for name in hand.freedoms))
-    finger = link.split("_")[0]
-    return fingers.index(finger) if finger in fingers else -1
 
 
 def _opposition(points: Tensor, normals: Tensor, touched: Tensor, contact: Tensor) -> Tensor:

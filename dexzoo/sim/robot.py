@@ -30,7 +30,7 @@ def add_hand(world: mujoco.MjSpec, hand: HandSpec) -> None:
     bodies = {hand.palm: palm}
     for joint in hand.joints:
         body = bodies[joint.parent].add_body(
-            name=joint.child, pos=joint.origin[:3, 3], quat=_quaternion(joint.origin[:3, :3])
+            name=joint.child, pos=joint.origin[:3, 3], quat=to_quaternion(joint.origin[:3, :3])
         )
         bodies[joint.child] = body
         if joint.axis is None:
@@ -99,7 +99,7 @@ def _add_primitive(body: mujoco.MjsBody, primitive: Primitive) -> None:
         type=mujoco.mjtGeom.mjGEOM_CAPSULE if primitive.is_capsule else mujoco.mjtGeom.mjGEOM_BOX,
         size=[primitive.radius, primitive.half[0], 0] if primitive.is_capsule else primitive.half,
         pos=primitive.pose[:3, 3],
-        quat=_quaternion(turn),
+        quat=to_quaternion(turn),
         contype=HAND,
         conaffinity=HAND | OBJECT | TABLE,
         condim=4,
@@ -109,7 +109,8 @@ def _add_primitive(body: mujoco.MjsBody, primitive: Primitive) -> None:
     )
 
 
-def _quaternion(turn: NDArray[np.float64]) -> NDArray[np.float64]:
+def to_quaternion(turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4,) wxyz of a rotation matrix (3, 3), as MuJoCo computes it."""
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, turn.reshape(-1))
     return quaternion

@@ -13,7 +13,7 @@ from dexzoo import rotation
 from dexzoo.camera import MAX_DEPTH, Camera, Observation, add_sensor_noise
 from dexzoo.hand import HandSpec
 from dexzoo.sim.objects import ObjectModel
-from dexzoo.sim.robot import HAND, OBJECT, TABLE, add_hand
+from dexzoo.sim.robot import HAND, OBJECT, TABLE, add_hand, to_quaternion
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,8 @@ class Scene:
             userface=mesh.faces.astype(np.int32).ravel(),
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
-        quaternion = np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, self.T_world_object[:3, :3].ravel())
-        body = world.worldbody.add_body(pos=self.T_world_object[:3, 3], quat=quaternion)
+        pose = self.T_world_object
+        body = world.worldbody.add_body(pos=pose[:3, 3], quat=to_quaternion(pose[:3, :3]))
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="object", group=_VISUAL_GROUP)
         model = world.compile()
         data = mujoco.MjData(model)

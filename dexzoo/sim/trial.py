@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dexzoo import rotation
 from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE, Grasps, pose_matrix
 from dexzoo.hand import Hand
+from dexzoo.sim.robot import to_quaternion
 from dexzoo.sim.scene import REFERENCE, WORKING, Physics, Scene
 
 APPROACH_DISTANCE = 0.05
@@ -85,10 +86,8 @@ def touches_table(grasps: Grasps, hand: Hand, steps: int = 4) -> NDArray[np.bool
     keys = torch.cat((torch.zeros(1, dtype=torch.float64), keys))
     wrist, turn, angles = _interpolate(position, quaternion, joints, keys)
     links = hand.forward_kinematics(angles)
-    poses = torch.eye(4, dtype=torch.float64).repeat(*wrist.shape[:2], 1, 1)
-    poses[..., :3, :3], poses[..., :3, 3] = rotation.to_matrix(turn), wrist
     table = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
-    low = hand.clearance(poses[:, :, None] @ links, table).amin((-1, -2))
+    low = hand.clearance(pose_matrix(wrist, turn)[:, :, None] @ links, table).amin((-1, -2))
     return np.asarray((low < 0).numpy())
 
 
@@ -178,8 +177,7 @@ class _Execution:
         self.center = scene.object.inertia[0]
         at = self.object_at
         self.qpos[:, at : at + 3] = scene.T_world_object[:3, 3]
-        mujoco.mju_mat2Quat(quaternion := np.zeros(4), scene.T_world_object[:3, :3].ravel())
-        self.qpos[:, at + 3 : at + 7] = quaternion
+        self.qpos[:, at + 3 : at + 7] = to_quaternion(scene.T_world_object[:3, :3])
         position, turn, joints = (part[:, 0].numpy() for part in _path(grasps))
         at = self.wrist_at
         self.qpos[: len(grasps), at : at + 7] = np.concatenate((position, turn), axis=1)
