@@ -13,22 +13,9 @@ from dexzoo import rotation
 from dexzoo.camera import MAX_DEPTH, Camera, Observation, add_sensor_noise
 from dexzoo.hand import HandSpec
 from dexzoo.sim.objects import ObjectModel
-from dexzoo.sim.robot import HAND, OBJECT, TABLE, add_hand, to_quaternion
+from dexzoo.sim.robot import add_hand, to_quaternion
+from dexzoo.sim.world import WORKING, Physics, make_world
 
-
-@dataclass(frozen=True)
-class Physics:
-    """How finely a trial is simulated. timestep in seconds; stops_early: a trial ends once its object is lost."""
-
-    timestep: float = 0.004
-    noslip_iterations: int = 0
-    stops_early: bool = True
-
-
-WORKING = Physics()
-"""What all labels are made with."""
-REFERENCE = Physics(timestep=0.001, noslip_iterations=5, stops_early=False)
-"""What the labels are compared with."""
 SETTLE_TIME = 4.0
 MIN_PIXELS = 250
 _VISUAL_GROUP = 3
@@ -55,7 +42,7 @@ class Scene:
         Raises ValueError when it does not come to rest near the origin in three tries.
         """
         rng = np.random.default_rng(seed)
-        model = _world(obj, WORKING).compile()
+        model = make_world(obj, WORKING).compile()
         data = mujoco.MjData(model)
         low = obj.mesh.bounds[0][2]
         for _ in range(3):
@@ -88,7 +75,7 @@ class Scene:
 
     def model(self, hand: HandSpec, physics: Physics = WORKING) -> mujoco.MjModel:
         """The world of a trial: table, object and hand. The object's free joint is `object`, the wrist's `wrist`."""
-        world = _world(self.object, physics)
+        world = make_world(self.object, physics)
         add_hand(world, hand)
         return world.compile()
 
@@ -161,49 +148,6 @@ class Scene:
         depth[depth > MAX_DEPTH] = 0
         normals = normal.reshape(*length.shape, 3) @ pose[:3, :3]
         return depth, normals, geom.reshape(length.shape) == 1
-
-
-def _world(obj: ObjectModel, physics: Physics) -> mujoco.MjSpec:
-    """Table and object. The object's friction acts on all its contacts, since its geoms have priority."""
-    world = mujoco.MjSpec()
-    world.compiler.degree = False
-    option = world.option
-    option.timestep = physics.timestep
-    option.noslip_iterations = physics.noslip_iterations
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = 10
-    world.worldbody.add_geom(
-        name="table",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[2, 2, 0.1],
-        contype=TABLE,
-        conaffinity=HAND | OBJECT,
-        friction=[0.5, 0.005, 0.0001],
-    )
-    center, inertia = obj.inertia
-    body = world.worldbody.add_body(name="object", mass=obj.mass, ipos=center, explicitinertial=True)
-    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    body.add_freejoint(name="object")
-    for index, hull in enumerate(obj.hulls):
-        world.add_mesh(
-            name=f"hull_{index}",
-            uservert=hull.vertices.astype(np.float32).ravel(),
-            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
-        )
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"hull_{index}",
-            contype=OBJECT,
-            conaffinity=HAND | TABLE,
-            priority=1,
-            condim=4,
-            friction=[obj.friction, 0.005 * obj.friction, 0.0001 * obj.friction],
-            solref=[0.01, 1],
-            solimp=[0.95, 0.99, 0.001, 0.5, 2],
-            mass=0,
-        )
-    return world
 
 
 def _draw_pose(rng: np.random.Generator, center: NDArray[np.float64]) -> NDArray[np.float64]:
