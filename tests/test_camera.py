@@ -13,14 +13,16 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from dexzoo.camera import Camera, Observation, add_sensor_noise, colourise, fit_table
+from dexzoo.camera import Camera, Observation, colourise
+from dexzoo.segmentation import fit_table
+from dexzoo.sensor import add_sensor_noise
 
 CAMERA = Camera()
 CENTER, RADIUS = np.array([0.02, -0.01, 0.05]), 0.05  # a ball on the table
 
 
-def look_at(eye: list[float], target: list[float]) -> np.ndarray:
-    """T_world_camera of an upright camera."""
+def look_from(eye: list[float], target: list[float]) -> np.ndarray:
+    """T_world_camera of an upright camera, apart from the package's own."""
     z = np.subtract(target, eye)
     z = z / np.linalg.norm(z)
     x = np.cross(z, [0, 0, 1])
@@ -68,7 +70,7 @@ def render(T: np.ndarray, things: str = "ball", camera: Camera = CAMERA) -> tupl
     return np.where(np.isfinite(depth), depth, 0), mask
 
 
-T_WORLD_CAMERA = look_at([0.5, -0.3, 0.45], [0.05, 0.03, 0.0])
+T_WORLD_CAMERA = look_from([0.5, -0.3, 0.45], [0.05, 0.03, 0.0])
 
 
 def noisy(depth: np.ndarray, sigma: float = 0.001) -> np.ndarray:
@@ -106,8 +108,8 @@ def test_camera_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("things", ["ball", "box", "ball wall", "none"])
 @pytest.mark.parametrize("eye", [[0.5, -0.3, 0.45], [-0.2, 0.4, 0.7]], ids=["low", "high"])
 def test_table_is_fitted(things: str, eye: list[float]) -> None:
-    T = look_at(eye, [0, 0, 0.03])
-    plane = fit_table(noisy(render(T, things)[0]).astype(np.float32), CAMERA)
+    T = look_from(eye, [0, 0, 0.03])
+    plane = fit_table((CAMERA.directions() * noisy(render(T, things)[0])[..., None]).reshape(-1, 3))
     assert np.linalg.norm(plane[:3]) == pytest.approx(1)
     assert np.rad2deg(np.arccos(min(plane[:3] @ T[2, :3], 1))) < 0.5
     assert abs(plane[3] - T[2, 3]) < 0.002

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexzoo import rotation
-from dexzoo.camera import MAX_DEPTH, Camera, Observation, add_sensor_noise
+from dexzoo.camera import Camera, Observation
 from dexzoo.hand import HandSpec
+from dexzoo.segmentation import MAX_DEPTH
+from dexzoo.sensor import add_sensor_noise
 from dexzoo.sim.objects import ObjectModel
 from dexzoo.sim.robot import add_hand, to_quaternion
 from dexzoo.sim.world import WORKING, Physics, make_world
