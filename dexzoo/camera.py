@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -63,14 +63,21 @@ class Camera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
     def directions(self) -> NDArray[np.float64]:
-        """(height, width, 3) viewing directions with z = 1, camera frame."""
-        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        return np.stack(((u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)), axis=-1)
+        """(height, width, 3) viewing directions with z = 1, camera frame; not to be written to."""
+        return _directions(self)
 
     def project(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """Pixel coordinates (*batch, 2) of points (*batch, 3) in the camera frame."""
         homogeneous = np.asarray(points, np.float64) @ self.matrix.T
         return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+@lru_cache(maxsize=4)
+def _directions(camera: Camera) -> NDArray[np.float64]:
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = np.stack(((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)), axis=-1)
+    rays.setflags(write=False)
+    return rays
 
 
 def upright(forward: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
