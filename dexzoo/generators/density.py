@@ -127,7 +127,7 @@ class GraspDensity:
     ) -> None:
         self.widths = widths or Bandwidths()
         self.hand, self.floor = hand, floor
-        self.demonstrations = list(demonstrations)
+        self.demonstrations, self.surface = list(demonstrations), surface
         generator = generator or torch.Generator().manual_seed(0)
         models = [contact_models(d, hand, self.widths) for d in demonstrations]
         most = max(len(row) for row in models)

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dexzoo import rotation
-from dexzoo.camera import MIN_POINTS, Observation
+from dexzoo.camera import Observation
+from dexzoo.segmentation import MIN_POINTS
 
 RADIUS = 0.015
 """Metres around a point that its normal and curvatures are fitted in (Kopicki's 15 mm)."""
@@ -128,7 +129,7 @@ class Features:
         The features are in the world frame. What would have been in plain view of the camera is left out: it would have
         been seen.
         """
-        (x, y), _, _ = cv2.minAreaRect(self.points[:, :2].numpy())
+        (x, y), _, _ = cv2.minAreaRect(self.points[:, :2].contiguous().numpy())
         points = self.points * self.points.new_tensor([-1.0, -1, 1]) + self.points.new_tensor([2 * x, 2 * y, 0])
         half_round = self.points.new_tensor([0.0, 0, 0, 1])
         turned = Features(points, rotation.normalize(rotation.multiply(half_round, self.quaternion)), self.curvature)

@@ -52,15 +52,19 @@ class KopickiGenerator(GraspGenerator):
         widths: Bandwidths | None = None,
         search: Literal["gradient", "annealing"] = "gradient",
         num_steps: tuple[int, int] = (20, 40),
+        completes: bool = True,
     ) -> None:
         self.hand: Hand = default_hand()
         self.demonstrations = list(demonstrations or load_demonstrations())
         self.num_per_type, self.num_samples, self.num_kernels = num_per_type, num_samples, num_kernels
         self.widths, self.search, self.num_steps = widths or Bandwidths(), search, num_steps
+        self.completes = completes
 
     def density(self, observation: Observation, seed: int = 0) -> GraspDensity:
         """The likelihood of grasps of the object seen, in the world frame."""
         surface = Features.of_view(observation, NUM_FEATURES, np.random.default_rng(seed))
+        if self.completes:
+            surface = surface.completed(observation)
         generator = torch.Generator().manual_seed(seed)
         return GraspDensity(self.demonstrations, surface, self.hand, self.num_kernels, self.widths, generator=generator)
 
@@ -73,7 +77,7 @@ class KopickiGenerator(GraspGenerator):
             raise ValueError(f"num_grasps is {num_grasps}, expected at least 1")
         generator = torch.Generator().manual_seed(seed)
         density = self.density(observation, seed)
-        way = Way(self.demonstrations, self.hand, observation, generator)
+        way = Way(self.demonstrations, self.hand, density.surface.points, generator)
         with torch.no_grad():
             grips = density.sample(self.num_samples, generator)
             grips = best(grips, density.screen(grips) - way.table_cost(grips), self.num_samples // 20)
@@ -98,10 +102,9 @@ class Way:
     """How a grip is come to and squeezed: the demonstrated path carried over rigidly, and what stands in its way."""
 
     def __init__(
-        self, demonstrations: Sequence[Demonstration], hand: Hand, observation: Observation, generator: torch.Generator
+        self, demonstrations: Sequence[Demonstration], hand: Hand, cloud: Tensor, generator: torch.Generator
     ) -> None:
         self.hand = hand
-        cloud = torch.from_numpy(observation.points_world)
         self.points = cloud[torch.randperm(len(cloud), generator=generator)[:NUM_OBSTACLES]]
         self.types = torch.tensor([d.grasp_type for d in demonstrations])
         keys = torch.cat([d.grasp.waypoints[:, [PREGRASP, GRIP, SQUEEZE]] for d in demonstrations])
