@@ -37,9 +37,6 @@ VERSION = "1"
 DEPTH_UNIT = 1e-4
 TABLES = ("scenes", "views", "grasps")
 SPLITS = ("train", "validation", "test")
-AIMED_CAMERA = Camera(
-    IMAGE_SIZE, IMAGE_SIZE, 574 * IMAGE_SIZE / 460, 574 * IMAGE_SIZE / 460, (IMAGE_SIZE - 1) / 2, (IMAGE_SIZE - 1) / 2
-)
 
 _POSE = pa.list_(pa.float64(), 16)
 SCHEMAS = {
@@ -96,7 +93,7 @@ def decode_view(row: dict[str, Any]) -> Observation:
         raise ValueError(f"the depth of scene {row['scene']}, view {row['view']} is no {IMAGE_SIZE} x {IMAGE_SIZE} PNG")
     depth = image.astype(np.float32) * np.float32(DEPTH_UNIT)
     pose = np.array(row["T_world_camera"], np.float64).reshape(4, 4)
-    return Observation(depth, AIMED_CAMERA, pose, mask=depth > 0)
+    return Observation(depth, Camera.aimed(), pose, mask=depth > 0)
 
 
 def encode_path(grasps: Grasps, hand: Hand) -> NDArray[np.float32]:

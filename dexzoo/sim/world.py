@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import trimesh
+from numpy.typing import NDArray
 
-from dexzoo.sim.objects import ObjectModel
-from dexzoo.sim.robot import HAND, OBJECT, TABLE
+from dexzoo.sim.objects import Mesh, ObjectModel
+from dexzoo.sim.robot import HAND, OBJECT, TABLE, to_quaternion
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,33 @@ REFERENCE = Physics(timestep=0.001, carry_timestep=0.001, noslip_iterations=5, s
 """What the labels are compared with."""
 
 
-def make_world(obj: ObjectModel, physics: Physics) -> mujoco.MjSpec:
-    """Table and object. The object's friction acts on all its contacts, since its geoms have priority."""
+@dataclass(frozen=True)
+class Support:
+    """A block fixed to the table in its middle, which an object lies on so that fingers get under it.
+
+    half: its half sizes in m; yaw in radians about the vertical. It stands on z = 0 over the world's origin.
+    """
+
+    half: tuple[float, float, float]
+    yaw: float
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """T_world_support (4, 4), of the block's centre."""
+        pose = np.eye(4)
+        pose[:2, :2] = [[np.cos(self.yaw), -np.sin(self.yaw)], [np.sin(self.yaw), np.cos(self.yaw)]]
+        pose[2, 3] = self.half[2]
+        return pose
+
+    @property
+    def mesh(self) -> Mesh:
+        """Its surface in the world frame."""
+        box: Mesh = trimesh.creation.box(2 * np.array(self.half), self.pose)
+        return box
+
+
+def make_world(obj: ObjectModel, physics: Physics, support: Support | None = None) -> mujoco.MjSpec:
+    """Table, support and object. The object's friction acts on all its contacts, since its geoms have priority."""
     world = mujoco.MjSpec()
     world.compiler.degree = False
     option = world.option
@@ -51,6 +78,18 @@ def make_world(obj: ObjectModel, physics: Physics) -> mujoco.MjSpec:
         conaffinity=HAND | OBJECT,
         friction=[0.5, 0.005, 0.0001],
     )
+    if support is not None:
+        world.worldbody.add_geom(
+            name="support",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=support.half,
+            pos=support.pose[:3, 3],
+            quat=to_quaternion(support.pose[:3, :3]),
+            contype=TABLE,
+            conaffinity=HAND | OBJECT,
+            condim=4,
+            friction=[0.5, 0.005, 0.0001],
+        )
     center, inertia = obj.inertia
     body = world.worldbody.add_body(name="object", mass=obj.mass, ipos=center, explicitinertial=True)
     body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
