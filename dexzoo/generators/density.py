@@ -47,8 +47,6 @@ MIN_CONTACT = 50
 MAX_CONTACT = 400
 """Kernels of a contact model; more points are thinned out."""
 _CHUNK = 256
-NUM_POSTURES = 200
-"""Kernels along the path of the hand-configuration model, from as far open as the path goes to as far closed again."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +116,7 @@ class GraspDensity:
     def __init__(
         self,
         demonstrations: Sequence[Demonstration],
+        models: Sequence[Sequence[ContactModel]],
         surface: Features,
         hand: Hand,
         num_kernels: int = 5000,
@@ -129,7 +128,6 @@ class GraspDensity:
         self.hand, self.floor = hand, floor
         self.demonstrations, self.surface = list(demonstrations), surface
         generator = generator or torch.Generator().manual_seed(0)
-        models = [contact_models(d, hand, self.widths) for d in demonstrations]
         most = max(len(row) for row in models)
         count = len(models)
         self.links = torch.zeros(count, most, dtype=torch.long)
@@ -146,16 +144,8 @@ class GraspDensity:
                 self.kernel_quaternion[row, column] = quaternion
                 self.log_weight[row, column] = (weight / weight.max()).log()
         self.kernel_turn = rotation.to_matrix(self.kernel_quaternion).flatten(-2)
-        self.postures, self.posture_log_weight = self._postures()
-
-    def _postures(self) -> tuple[Tensor, Tensor]:
-        """(d, t, 20) postures of C along each path, from t = -1 (the pre-grasp) by 0 (the grip) to 1, and ln exp(-|t|)."""
-        t = torch.linspace(-1, 1, NUM_POSTURES)
-        rows = []
-        for d in self.demonstrations:
-            start, end = d.grasp.joints[0, PREGRASP], d.grasp.joints[0, GRIP]
-            rows.append(self.hand.clamp(end + t[:, None] * (end - start)))
-        return torch.stack(rows), -t.abs()
+        joints = torch.cat([d.grasp.joints[:, [PREGRASP, GRIP]] for d in demonstrations])
+        self.grip, self.closing = joints[:, 1], joints[:, 1] - joints[:, 0]
 
     def sample(self, num: int, generator: torch.Generator) -> Grips:
         """Draw `num` grips of each demonstration, demonstration by demonstration.
@@ -164,9 +154,9 @@ class GraspDensity:
         kinematics the wrist.
         """
         rows = torch.arange(len(self.demonstrations)).repeat_interleave(num)
-        column = torch.multinomial(self.active[rows].float(), 1, generator=generator).squeeze(-1)
-        weight = self.log_weight[rows, column].exp()
-        kernel = torch.multinomial(weight, 1, generator=generator).squeeze(-1)
+        column = _draw(self.active.float(), rows, generator)
+        width = self.links.shape[1]
+        kernel = _draw(self.log_weight.exp().flatten(0, 1).nan_to_num_(), rows * width + column, generator)
         place = (rows, column, kernel)
         step = torch.randn(len(rows), 3, generator=generator)
         away = self.widths.position * torch.randn(len(rows), 1, generator=generator)
@@ -174,16 +164,16 @@ class GraspDensity:
         seed = int(torch.randint(2**31, (1,), generator=generator))
         turn = vonmises_fisher([1.0, 0, 0, 0], self.widths.concentration).rvs(len(rows), random_state=seed)
         quaternion = rotation.multiply(self.kernel_quaternion[place], torch.tensor(turn, dtype=torch.float32))
-        # t of the path is normal, cut at the ends of the path
+        # t of the path is normal, and lies on the path
         t = torch.fmod(torch.randn(len(rows), generator=generator), 1.0)
-        middle = self.postures[rows, ((t + 1) / 2 * (NUM_POSTURES - 1)).round().long()]
+        middle = self.hand.reduce(self.grip[rows] + t[:, None] * self.closing[rows])
         noise = torch.randn(len(rows), len(self.hand.freedoms), generator=generator)
-        free = self.hand.clamp(self.hand.reduce(middle) + self.widths.joint * noise)
+        free = self.hand.clamp(middle + self.widths.joint * noise)
         relative = self.hand.forward_kinematics(self.hand.expand(free))[torch.arange(len(rows)), self.links[rows, column]]
         wrist = pose_matrix(position, rotation.normalize(quaternion)) @ torch.linalg.inv(relative)
         return Grips(rows, wrist, free)
 
-    def screen(self, grips: Grips, num: int = 400) -> Float[Tensor, " grip"]:
+    def screen(self, grips: Grips, num: int = 250) -> Float[Tensor, " grip"]:
         """A quick estimate of the likelihood, from the first `num` kernels, which are as random as the rest."""
         position, turn = self._link_poses(grips)
         total = self.log_posture(grips)
@@ -200,7 +190,7 @@ class GraspDensity:
                 total[rows] += link * (self.links.shape[1] / len(columns))
         return total
 
-    def neighbours(self, grips: Grips, num: int = 32) -> tuple[Tensor, Tensor, Tensor]:
+    def neighbours(self, grips: Grips, num: int = 24) -> tuple[Tensor, Tensor, Tensor]:
         """The kernels that matter near each grip: positions (n, l, num, 3), turns (n, l, num, 9), ln weights (n, l, num).
 
         A kernel five bandwidths away weighs e^-25: so few are enough, and they serve as long as the grip stays near.
@@ -234,12 +224,16 @@ class GraspDensity:
         return contact * self.links.shape[1] + self.log_posture(grips)
 
     def log_posture(self, grips: Grips) -> Float[Tensor, " grip"]:
-        """ln C: how near the posture is to the demonstrated path."""
-        joints = self.hand.expand(grips.joints)
-        # Sum of squares over joints by way of products: postures (d, t, 20) against (n, 20)
-        rows = self.postures[grips.demo]
-        apart = (rows - joints[:, None]).square().sum(-1) / self.widths.joint**2
-        return (self.posture_log_weight - apart).logsumexp(-1)
+        """ln C: how near the posture is to the demonstrated path, and how near on it to the grip.
+
+        The path runs from t = -1 at the pre-grasp by the grip at 0 as far again to t = 1, with weight exp(-|t|), and
+        Gaussian kernels stand on it without gaps: what counts is the nearest.
+        """
+        closing = self.closing[grips.demo]
+        away = self.hand.expand(grips.joints) - self.grip[grips.demo]
+        t = ((away * closing).sum(-1) / closing.square().sum(-1).clamp_min(1e-6)).clamp(-1, 1)
+        apart = (away - t[:, None] * closing).square().sum(-1) / self.widths.joint**2
+        return -t.abs() - apart
 
     def _link_poses(self, grips: Grips) -> tuple[Tensor, Tensor]:
         """Positions (n, l, 3) and rotation matrices (n, l, 9) of the links in contact."""
@@ -271,8 +265,17 @@ def _query(
     spread = bandwidth * model.curvature.std(0).clamp_min(1e-4)
     unlike = ((surface.curvature[:, None] - model.curvature) / spread).square().sum(-1)
     likeness = (model.weight * torch.exp(-unlike)).clamp_min(1e-10 / len(model.weight))
-    chosen = torch.multinomial(likeness[which], 1, generator=generator).squeeze(-1)
+    chosen = _draw(likeness, which, generator)
     turn = rotation.multiply(surface.quaternion[which], surface[which].ambiguous_turn(generator))
     position = surface.points[which] + rotation.rotate(turn, model.position[chosen])
     quaternion = rotation.normalize(rotation.multiply(turn, model.quaternion[chosen]))
     return position, quaternion, likeness.sum(1)[which]
+
+
+def _draw(weight: Float[Tensor, "row n"], rows: Tensor, generator: torch.Generator) -> Tensor:
+    """An index drawn by the weights of each of the rows given; by inversion of one cumulative sum over all rows."""
+    share = weight.double() / weight.double().sum(1, keepdim=True)
+    bounds = share.cumsum(1).clamp_max(1) + torch.arange(len(weight))[:, None]
+    value = rows + torch.rand(len(rows), generator=generator, dtype=torch.float64) * (1 - 1e-9)
+    index = torch.searchsorted(bounds.flatten(), value, right=True) - rows * weight.shape[1]
+    return index.clamp(0, weight.shape[1] - 1)

@@ -16,7 +16,7 @@ from torch import Tensor
 from dexzoo import rotation
 from dexzoo.camera import Observation
 from dexzoo.generators.demonstration import Demonstration, load_demonstrations
-from dexzoo.generators.density import Bandwidths, GraspDensity, Grips
+from dexzoo.generators.density import Bandwidths, GraspDensity, Grips, contact_models
 from dexzoo.generators.features import Features
 from dexzoo.generators.generator import GraspGenerator
 from dexzoo.generators.search import anneal, climb
@@ -47,7 +47,7 @@ class KopickiGenerator(GraspGenerator):
         self,
         demonstrations: Sequence[Demonstration] | None = None,
         num_per_type: int = 10,
-        num_samples: int = 2000,
+        num_samples: int = 1000,
         num_kernels: int = 5000,
         widths: Bandwidths | None = None,
         search: Literal["gradient", "annealing"] = "gradient",
@@ -59,6 +59,7 @@ class KopickiGenerator(GraspGenerator):
         self.num_per_type, self.num_samples, self.num_kernels = num_per_type, num_samples, num_kernels
         self.widths, self.search, self.num_steps = widths or Bandwidths(), search, num_steps
         self.completes = completes
+        self.models = [contact_models(d, self.hand, self.widths) for d in self.demonstrations]
 
     def density(self, observation: Observation, seed: int = 0) -> GraspDensity:
         """The likelihood of grasps of the object seen, in the world frame."""
@@ -66,7 +67,7 @@ class KopickiGenerator(GraspGenerator):
         if self.completes:
             surface = surface.completed(observation)
         generator = torch.Generator().manual_seed(seed)
-        return GraspDensity(self.demonstrations, surface, self.hand, self.num_kernels, self.widths, generator=generator)
+        return GraspDensity(self.demonstrations, self.models, surface, self.hand, self.num_kernels, self.widths, generator=generator)
 
     def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
         """At most `num_grasps` grasps in the camera frame, the likeliest first, at most `num_per_type` of each type.
