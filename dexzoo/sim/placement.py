@@ -18,7 +18,7 @@ SUPPORT_HEIGHT = 0.04
 FINGER_CLEARANCE = 0.022
 """What a supported object keeps from the table, in metres: a finger's thickness."""
 LONG = ("fork", "knife", "scissors", "spatula", "spoon")
-"""Categories of long flat things; they lie on a block of 40 % of their length and 70 % of their width."""
+"""Categories of long flat things; they lie on a block of 70 % of their width and up to 40 % of their length."""
 WIDE = ("dustpan", "pan", "plate")
 """Categories whose rim would lie too low for fingers; they lie on a square block of half their smaller extent."""
 DROP = 0.005
@@ -58,12 +58,17 @@ def place(obj: ObjectModel, seed: int) -> tuple[NDArray[np.float64], Support | N
 
 def support_for(obj: ObjectModel) -> Support | None:
     """The block that objects of this category lie on, narrower than they are, so that fingers get under them."""
-    x, y = (float(extent) for extent in obj.mesh.extents[:2])
+    extents = obj.mesh.extents[:2]
     if obj.category in LONG:
-        along, across = (0.2, 0.35) if x > y else (0.35, 0.2)
-        return Support((along * x, across * y, SUPPORT_HEIGHT / 2), 0.0)
+        axis = int(extents.argmax())
+        # the block stands below the centre of mass, from where one end may be near
+        reach = np.abs(obj.mesh.bounds[:, axis] - obj.inertia[0][axis]).min()
+        half = 0.35 * extents
+        half[axis] = max(min(0.2 * extents[axis], reach - FINGER_CLEARANCE), 0.01)
+        return Support((float(half[0]), float(half[1]), SUPPORT_HEIGHT / 2), 0.0)
     if obj.category in WIDE:
-        return Support((min(x, y) / 4, min(x, y) / 4, SUPPORT_HEIGHT / 2), 0.0)
+        side = float(extents.min()) / 4
+        return Support((side, side, SUPPORT_HEIGHT / 2), 0.0)
     return None
 
 
