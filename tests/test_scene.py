@@ -362,6 +362,6 @@ def test_a_given_camera_and_pose_are_honoured(can_scene: Scene) -> None:
 @pytest.mark.parametrize(("target", "distance"), [((2.0, 2.0, 0.0), 0.5), ((0.0, 0.0, 0.05), 1.3)])
 def test_an_object_out_of_sight_is_reported(can_scene: Scene, target: tuple[float, ...], distance: float) -> None:
     scene = replace(can_scene, T_world_camera=None)
-    with pytest.raises(ValueError, match=r"object can_01 covers \d+ pixels, fewer than 250"):
+    with pytest.raises(ValueError, match=r"object can_07 covers \d+ pixels, fewer than 250"):
         scene.observe(camera=SMALL, T_world_camera=look_at(np.array(target), distance, 0.0, 0.8))
     assert scene.T_world_camera is None, "a view that failed leaves no camera"
