@@ -16,9 +16,7 @@ EDGE = 0.05
 STEPS = [WORKING.timestep, WORKING.carry_timestep]
 
 
-def between_plates(
-    mass: float, friction: float, force: float, timestep: float
-) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def between_plates(mass: float, friction: float, force: float, timestep: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """A cube held in the air by two plates that are pushed together, each by `force` newtons."""
     cube = trimesh.creation.box([EDGE] * 3)
     world = make_world(ObjectModel("cube", cube, (cube,), mass, friction), replace(WORKING, timestep=timestep))
