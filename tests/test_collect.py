@@ -1,6 +1,7 @@
 """Collecting grasp sets: the same bytes however it is run, splits by object, and rows that say what happened."""
 
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
