@@ -22,17 +22,11 @@ from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import Grasps
 from dexzoo.hand import Hand, default_hand
 from dexzoo.sim import Outcomes, Scene, trial
-from dexzoo.sim.shapes import MASS_RANGE, make_object, object_names
+from dexzoo.sim.shapes import MASS_RANGE, make_object, object_names, split_of
 
 NUM_VIEWS = 4
 NUM_GENERATED = 48
 NUM_NEIGHBOURS = 48
-
-
-def split_of(name: str) -> str:
-    """The split of an object: of each category every fourth is test, every eighth validation."""
-    number = int(name.rpartition("_")[2])
-    return "test" if number % 4 == 3 else "validation" if number % 8 == 1 else "train"
 
 
 def collect(folder: Path, num_scenes: int, workers: int = 1, seed: int = 0) -> Iterator[str]:
