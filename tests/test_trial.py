@@ -12,7 +12,7 @@ from dexzoo.camera import Observation
 from dexzoo.grasp import Grasps
 from dexzoo.hand import Hand
 from dexzoo.sim import Outcomes, Scene, trial
-from dexzoo.sim.motion import END, Motion
+from dexzoo.sim.motion import END, LIFT_START, Motion
 from dexzoo.sim.world import REFERENCE, WORKING, Support
 from dexzoo.verification import verify
 
@@ -59,6 +59,9 @@ def test_some_grasps_hold_and_some_do_not(can_outcomes: Outcomes) -> None:
         assert (motion[can_outcomes.success] >= 0).all()
     assert can_outcomes.shift[can_outcomes.success].max() < 0.1
     assert can_outcomes.lost_at[lost].max() <= trial.LIFT + trial.HOLD
+    lifted = can_outcomes.success | (can_outcomes.lost_at > 0)
+    assert np.isfinite(can_outcomes.closing_shift[lifted]).all()
+    assert np.isfinite(can_outcomes.closing_rotation[lifted]).all()
     np.testing.assert_array_equal(can_outcomes.success_rate, can_outcomes.success)
 
 
@@ -88,6 +91,25 @@ def test_a_replay_ends_as_the_trial_did(
         assert shift(world_grasps[index]) == pytest.approx(can_outcomes.shift[index], abs=1e-5)
     failed = int(np.flatnonzero(~can_outcomes.success)[0])
     assert shift(world_grasps[failed]) > 0.1
+
+
+def test_the_object_does_not_creep_out_of_the_hand(can_scene: Scene, good: Grasps, hand: Hand) -> None:
+    """Held for another ten seconds, at the working setting."""
+    execution = trial.Execution(can_scene, good, hand, can_scene.model(hand.spec), WORKING)
+    for time in (LIFT_START, END):
+        execution.advance(execution.everyone, time)
+    before = execution.in_palm(execution.everyone)
+    execution.advance(execution.everyone, END + 10)
+    assert np.linalg.norm((execution.in_palm(execution.everyone) - before)[:, :3], axis=1).max() < 0.002
+
+
+def test_the_hand_presses_hard_enough_to_bear_the_weight(can_scene: Scene, can_outcomes: Outcomes) -> None:
+    held = can_outcomes.success
+    np.testing.assert_array_equal(np.isfinite(can_outcomes.contact_force), held)
+    weight = 9.81 * can_scene.object.mass
+    needed = weight / np.hypot(1, can_scene.object.friction)  # no contact gives more than its friction cone
+    assert (can_outcomes.contact_force[held] > needed).all()
+    assert can_outcomes.contact_force[held].max() < 150
 
 
 def test_grasps_that_miss_lose_the_object(can_scene: Scene, good: Grasps, hand: Hand) -> None:
@@ -222,7 +244,7 @@ def test_a_diverged_trial_is_repeated_at_the_reference_setting(
 # the same however it is run
 
 
-@pytest.mark.parametrize(("num_threads", "batch"), [(1, 256), (2, 256), (2, 5)])
+@pytest.mark.parametrize(("num_threads", "batch"), [(1, 1024), (2, 1024), (2, 5), (1, 1)])
 def test_outcomes_depend_neither_on_threads_nor_on_batches(
     can_scene: Scene,
     world_grasps: Grasps,
@@ -233,10 +255,28 @@ def test_outcomes_depend_neither_on_threads_nor_on_batches(
     batch: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """All alike to the last bit; the fixture's fifty ran together on all cores."""
     monkeypatch.setattr(trial, "_BATCH", batch)
-    outcomes = trial.run(can_scene, world_grasps[some], hand, num_threads)
-    expected = Outcomes(*(getattr(can_outcomes, field.name)[some] for field in fields(Outcomes)))
-    assert_equal(outcomes, expected)
+    assert_equal(trial.run(can_scene, world_grasps[some], hand, num_threads), can_outcomes[some])
+
+
+def test_a_hundred_together_end_as_each_alone(can_scene: Scene, world_grasps: Grasps, some: np.ndarray) -> None:
+    many = np.resize(some, 100)
+    assert_equal(verify(world_grasps[many], can_scene)[:2], verify(world_grasps[some[:2]], can_scene))
+    assert_equal(verify(world_grasps[many], can_scene)[-1:], verify(world_grasps[many[-1:]], can_scene))
+
+
+def test_a_copy_of_another_mass_and_friction_is_a_scene_of_that_object(
+    can_scene: Scene, good: Grasps, hand: Hand
+) -> None:
+    mass, friction = np.array([0.1, 0.5]), np.array([0.9, 0.4])
+    together = trial.run(can_scene, good[:2], hand, variation=trial.Variation(mass, friction))
+    for i in range(2):
+        obj = replace(can_scene.object, mass=float(mass[i]), friction=float(friction[i]))
+        alone = trial.run(replace(can_scene, object=obj), good[i : i + 1], hand)
+        assert together.success[i] == alone.success[0]
+        for name in ("closing_shift", "shift", "contact_force"):
+            np.testing.assert_allclose(getattr(together, name)[i], getattr(alone, name)[0], rtol=0.02)
 
 
 def test_both_frames_give_the_same_verdict(
