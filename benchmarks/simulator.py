@@ -129,7 +129,9 @@ def plain_loop(scene: Scene, grasps: Grasps) -> np.ndarray:
         data.qpos[:] = start.qpos[i]
         rest = data.qpos[start.object_at + 2]
         for step in range(wrist.shape[1]):
-            model.opt.timestep = WORKING.timestep if step < len(closing) else WORKING.carry_timestep
+            closes = step < len(closing)
+            model.opt.timestep = WORKING.timestep if closes else WORKING.carry_timestep
+            model.opt.noslip_iterations = WORKING.noslip_iterations if closes else WORKING.carry_noslip_iterations
             data.ctrl[:] = joints[i, step, start.order]
             data.mocap_pos[0], data.mocap_quat[0] = wrist[i, step], turn[i, step]
             mujoco.mj_step(model, data)

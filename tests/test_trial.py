@@ -262,8 +262,9 @@ def test_outcomes_depend_neither_on_threads_nor_on_batches(
 
 def test_a_hundred_together_end_as_each_alone(can_scene: Scene, world_grasps: Grasps, some: np.ndarray) -> None:
     many = np.resize(some, 100)
-    assert_equal(verify(world_grasps[many], can_scene)[:2], verify(world_grasps[some[:2]], can_scene))
-    assert_equal(verify(world_grasps[many], can_scene)[-1:], verify(world_grasps[many[-1:]], can_scene))
+    together = verify(world_grasps[many], can_scene)
+    for i in (0, 57, 99):
+        assert_equal(together[i : i + 1], verify(world_grasps[many[i : i + 1]], can_scene))
 
 
 def test_a_copy_of_another_mass_and_friction_is_a_scene_of_that_object(
@@ -295,11 +296,12 @@ def test_no_grasps_give_no_outcomes(can_scene: Scene, hand: Hand) -> None:
 def test_repeated_trials_tell_a_rate_that_the_seed_repeats(
     can_scene: Scene, world_grasps: Grasps, some: np.ndarray
 ) -> None:
+    friction = can_scene.object.friction
     first = verify(world_grasps[some], can_scene, seed=4, trials=3)
     np.testing.assert_allclose(first.success_rate * 3, np.round(first.success_rate * 3), atol=1e-6)
     assert len(np.unique(first.success_rate)) > 1
     assert_equal(verify(world_grasps[some], can_scene, seed=4, trials=3), first)
-    assert can_scene.object.friction == pytest.approx(0.523, abs=1e-3), "the scene stays as it was"
+    assert can_scene.object.friction == friction, "the scene stays as it was"
 
 
 # wrong calls

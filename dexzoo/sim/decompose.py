@@ -17,10 +17,9 @@ def main(source: str, target: str) -> None:
     coacd.set_log_level("error")
     surface = coacd.Mesh(mesh["vertices"], mesh["faces"])
     parts = coacd.run_coacd(surface, threshold=0.05, max_convex_hull=MAX_PARTS, seed=0)
-    arrays: dict[str, np.ndarray] = {}
-    for index, (vertices, faces) in enumerate(parts):
-        arrays |= {f"vertices_{index}": vertices, f"faces_{index}": faces}
-    np.savez(target, **arrays)
+    arrays = {f"vertices_{i}": vertices for i, (vertices, _) in enumerate(parts)}
+    arrays |= {f"faces_{i}": faces for i, (_, faces) in enumerate(parts)}
+    np.savez(target, allow_pickle=False, **arrays)
 
 
 if __name__ == "__main__":

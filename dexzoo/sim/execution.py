@@ -79,11 +79,14 @@ class Execution:
 
     def advance(self, ids: Ids, until: float) -> None:
         """Follow the motion up to a time since the start, which must not lie beyond the start of the lift before it."""
-        step = self.physics.timestep if self.time < LIFT_START - 1e-6 else self.physics.carry_timestep
+        physics, carries = self.physics, self.time > LIFT_START - 1e-6
+        step = physics.carry_timestep if carries else physics.timestep
         times = self.time + step * np.arange(1, round((until - self.time) / step) + 1, dtype=np.float64)
         if not len(times):
             return
         self.batch.expand("opt.timestep")[:] = step
+        sweeps = physics.carry_noslip_iterations if carries else physics.noslip_iterations
+        self.batch.expand("opt.noslip_iterations")[:] = sweeps
         wrist, turn, angles = self.motion.at(times, ids)
         state = mujoco.mjtState
         spec = state.mjSTATE_CTRL | state.mjSTATE_MOCAP_POS | state.mjSTATE_MOCAP_QUAT
