@@ -15,7 +15,7 @@ from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import GRIP, PREGRASP, SQUEEZE, Grasps
 from dexzoo.hand import Hand
 from dexzoo.sim import Outcomes
-from dexzoo.sim.shapes import MASS_RANGE
+from dexzoo.sim.shapes import MASS_RANGE, split_of
 
 SEED = 3
 
@@ -109,7 +109,7 @@ def test_rows_say_what_was_done(collected: Path, hand: Hand) -> None:
     read = GraspSet(collected)
     assert read.scenes["object"].to_pylist() == ["box_03", "can_02"]
     assert read.scenes["seed"].to_pylist() == [SEED, SEED]
-    assert read.scenes["split"].to_pylist() == ["test", "train"]
+    assert read.scenes["split"].to_pylist() == [split_of("box_03"), split_of("can_02")]
     for scene in read.scenes.to_pylist():
         assert MASS_RANGE[scene["category"]][0] <= scene["mass"] <= MASS_RANGE[scene["category"]][1]
         assert 0.5 <= scene["friction"] <= 1.0

@@ -145,7 +145,8 @@ def test_the_hidden_side_is_guessed(can_scene: Scene, can_view: Observation) -> 
     assert np.quantile(distance, 0.9) < 0.012
     assert ((mesh.face_normals[triangle] * normals).sum(1) > 0).mean() > 0.9
     middle = surface[:, :2].mean(0)
-    toward = (cloud[:, :2] - middle) @ (can_view.T_world_camera[:2, 3] - middle)
+    way = can_view.T_world_camera[:2, 3] - middle
+    toward = (cloud[:, :2] - middle) @ (way / np.linalg.norm(way))
     assert (toward > 0.01).any()
     assert (toward < -0.01).any()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)

@@ -87,7 +87,7 @@ def test_servos_and_joint_ranges_are_those_of_the_urdf(twin: mujoco.MjModel, han
     assert {twin.actuator(i).name for i in range(twin.nu)} == set(hand.joint_names)
 
 
-def test_the_geoms_are_the_shapes_of_hand_yaml(twin: mujoco.MjModel) -> None:
+def test_the_geoms_are_the_shapes_of_hand_yaml(twin: mujoco.MjModel, can_scene: Scene) -> None:
     shapes = yaml.safe_load((ROBOT / "hand.yaml").read_text())["primitives"]
     for link, expected in shapes.items():
         body = twin.body(link)
@@ -108,7 +108,7 @@ def test_the_geoms_are_the_shapes_of_hand_yaml(twin: mujoco.MjModel) -> None:
                 assert ends == {tuple(np.array(shape["capsule"][key], float)) for key in ("from", "to")}
     counts = sum(len(expected) for expected in shapes.values())
     assert sum(twin.body(link).geomnum[0] for link in shapes) == counts
-    assert twin.ngeom == counts + 2, "the can's one part and the table"
+    assert twin.ngeom == counts + len(can_scene.object.hulls) + 1, "the can's parts and the table"
 
 
 def test_palm_and_proximal_links_do_not_touch(twin: mujoco.MjModel, hand: Hand) -> None:

@@ -91,10 +91,11 @@ def make_object(name: str) -> ObjectModel:
     solid = _MAKERS[category](rng, number)
     low, high = solid.mesh.bounds
     shift = [-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]]
-    for mesh in (solid.mesh, *solid.parts):
-        mesh.apply_translation(shift).apply_scale(_MILLIMETRE)
+    mesh, *parts = (
+        each.copy().apply_translation(shift).apply_scale(_MILLIMETRE) for each in (solid.mesh, *solid.parts)
+    )
     mass, friction = float(rng.uniform(*MASS_RANGE[category])), float(rng.uniform(*_FRICTION))
-    return ObjectModel(name, solid.mesh, tuple(solid.parts), mass, friction, category)
+    return ObjectModel(name, mesh, tuple(parts), mass, friction, category)
 
 
 def split_of(name: str) -> str:

@@ -14,14 +14,14 @@ from dexzoo.sim.shapes.solid import Solid, hull, loft, turned, union
 Corners = Sequence[tuple[Number, ...]]
 
 
-def body(corners: Corners, square: Number = 2.0, until: Number = np.inf, flat: Number = 1.0) -> Solid:
+def body(corners: Corners, square: Number = 2, until: Number = np.inf, flat: Number = 1, blend: Number = 30) -> Solid:
     """A solid of revolution with corners (radius, height, cut) of its profile.
 
-    square: exponent of its section up to the height `until`, above which it turns round within 30 mm; flat: depth over
-    width.
+    square: exponent of its section up to the height `until`, above which it turns round within `blend`; flat: depth
+    over width.
     """
-    profile = rounded(corners, 12.0 if np.isfinite(until) else None)
-    share = np.clip((profile[:, 1] - until) / 30, 0, 1)
+    profile = rounded(corners, 10 if np.isfinite(until) else None)
+    share = np.clip((profile[:, 1] - until) / blend, 0, 1)
     if np.isinf(until):
         share = 0 * profile[:, 1]
     sections = turned(profile, exponent=square + (2 - square) * share)
@@ -81,12 +81,12 @@ def can(rng: np.random.Generator, style: int) -> Solid:
         r, h = u(30, 42), u(80, 118)
         bead = [(r + 1.2, 0), (r + 1.2, 3, 0.8), (r, 4.5)]
         return body(
-            [(0.8 * r, 0), *bead, (r, h - 4.5), (r + 1.2, h - 3, 0.8), (r + 1.2, h), (r - 1, h), (r - 2, h - 2.0)]
+            [(0.8 * r, 0), *bead, (r, h - 4.5), (r + 1.2, h - 3, 0.8), (r + 1.2, h), (r - 1, h), (r - 2, h - 1.5)]
         )
     if kind == "drink":
         r, h = u(26, 33), u(115, 165)
         foot, neck = 0.78 * r, 0.82 * r
-        top = [(r, h - 14, 4), (neck, h - 3, 2), (neck + 1, h - 2), (neck + 1, h), (neck - 1, h), (neck - 3, h - 2)]
+        top = [(r, h - 14, 4), (neck, h - 3, 2), (neck + 1, h - 2), (neck + 1, h), (neck - 1, h), (neck - 3, h - 1.5)]
         return body([(0.8 * foot, 0), (foot, 0, 1), (r, 9, 4), *top])
     if kind == "spray":
         r, h = u(22, 33), u(110, 160)
@@ -96,7 +96,7 @@ def can(rng: np.random.Generator, style: int) -> Solid:
     if kind == "tuna":
         r, h = u(34, 42), u(28, 48)
         return body(
-            [(0.8 * r, 0), (r, 0, 3), (r, h - 2), (r + 1.2, h - 2), (r + 1.2, h, 0.8), (r - 2, h), (r - 3, h - 2)]
+            [(0.8 * r, 0), (r, 0, 3), (r, h - 2), (r + 1.2, h - 2), (r + 1.2, h, 0.8), (r - 2, h), (r - 3, h - 1.5)]
         )
     if kind == "coffee":
         r, h = u(35, 42), u(90, 130)
@@ -158,9 +158,11 @@ def _sides(half: Number, height: Number) -> list[tuple[float, float, float]]:
 
 
 def ball(rng: np.random.Generator, style: int) -> Solid:
-    """A tennis ball and a smaller one."""
-    sphere = trimesh.creation.icosphere(4, (33.0, 26.0)[style % 2] * rng.uniform(0.97, 1.03))
-    return Solid(sphere, [hull(trimesh.creation.icosphere(3, sphere.extents[0] / 2).vertices)])
+    """A tennis ball and a smaller one. Its part has flat faces, some 8 mm wide, on which it comes to rest."""
+    radius = (33.0, 26.0)[style % 2] * rng.uniform(0.97, 1.03)
+    coarse = trimesh.creation.icosphere(2, radius)
+    coarse.apply_scale(2 * radius / (radius + np.linalg.norm(coarse.triangles_center, axis=1).min()))
+    return Solid(trimesh.creation.icosphere(4, radius), [coarse])
 
 
 def shaker(rng: np.random.Generator, style: int) -> Solid:
@@ -186,7 +188,7 @@ def shaker(rng: np.random.Generator, style: int) -> Solid:
     if kind == "glass":
         r, h = u(19, 25), u(50, 75)
         cap = [(0.86 * r, h), (0.95 * r, h), (0.95 * r, h + 13, 3), (0.6 * r, h + 21, 6), (3, h + 22)]
-        return body([(0.6 * r, 0), (r, 0, 4), (0.9 * r, h, 4), *cap], square=u(4, 7), until=h - 22)
+        return body([(0.6 * r, 0), (r, 0, 4), (0.9 * r, h, 4), *cap], square=u(4, 7), until=h - 14, blend=14)
     if kind == "cocktail":
         r, h = u(33, 39), u(125, 150)
         lid = [(r + 1.5, h), (r + 1.5, h + 4, 1), (0.62 * r, h + 34, 18), (0.55 * r, h + 38)]

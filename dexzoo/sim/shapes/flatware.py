@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexzoo.sim.shapes.containers import brick
 from dexzoo.sim.shapes.curves import Array, Number, divided, ellipse, rounded
 from dexzoo.sim.shapes.handles import grip
 from dexzoo.sim.shapes.shell import sheet
@@ -42,7 +41,7 @@ def spoon(rng: np.random.Generator, style: int) -> Solid:
     long, wide, depth = {
         "table": (u(30, 34), u(19, 22), u(7, 9)),
         "soup": (u(25, 28), u(23, 26), u(8, 10)),
-        "serving": (u(36, 42), u(26, 31), u(11, 14)),
+        "serving": (u(36, 42), u(26, 31), u(9, 11)),
         "tea": (u(22, 25), u(14, 16), u(5.5, 7)),
         "wooden": (u(32, 38), u(22, 27), u(6, 8)),
     }[kind]
@@ -76,7 +75,7 @@ def knife(rng: np.random.Generator, style: int) -> Solid:
     }[kind]
     x = np.linspace(0, 1, 15)
     edge = {
-        "chef": -width * (1 - 0.96 * x**2.6),
+        "chef": -width * (1 - 0.76 * x**2.6),
         "bread": -width * (1 - 0.75 * np.clip((x - 0.8) / 0.2, 0, 1) ** 2),
         "paring": -width * (1 - 0.95 * x**2),
         "cleaver": -width * (1 - 0.06 * x),
@@ -99,10 +98,10 @@ def spatula(rng: np.random.Generator, style: int) -> Solid:
     kind = ("turner", "rubber", "wooden", "fish")[style % 4]
     if kind == "rubber":
         long, wide, thick = u(75, 95), u(24, 30), u(2.2, 3)
-        path = np.column_stack((np.linspace(0, long, 13), np.full(13, 6.0)))
+        path = np.column_stack((np.linspace(0, long, 13), np.full(13, thick)))
         tip = np.sqrt(np.clip(1 - ((path[:, 0] / long - 0.8) / 0.205).clip(0, 1) ** 2, 0.12, 1))
         blade = loft(swept(path, wide * np.interp(path[:, 0], [0, 12], [0.6, 1]) * tip, thick, 5))
-        handle = grip([(8, 6), (-u(170, 200), 6)], [4.5, 4.5, 5, 8, 8], [4, 5, 5, 6, 5.5], 2.3)
+        handle = grip([(8, thick + 1), (-40, 6, 30), (-u(170, 200), 6)], [6, 5, 6, 9, 9], [thick, 4, 5, 6, 5.5], 3)
         return union(blade, handle)
     long, wide, thick = {
         "turner": (u(80, 100), u(34, 42), u(1.1, 1.4)),
@@ -129,7 +128,7 @@ def scissors(rng: np.random.Generator, style: int) -> Solid:
     blade, open_angle = blade * u(0.92, 1.08), (3.0, 12.0, 20.0)[style % 3] * u(0.8, 1.2)
     thick, width, shank = u(1.3, 1.6), u(7, 9), u(34, 46)
     halves = []
-    for side, level in ((1, 4.0 - 0.9 * thick), (-1, 4.0 + 0.9 * thick)):
+    for side, level in ((1, 4.0 - 0.75 * thick), (-1, 4.0 + 0.75 * thick)):
         x = np.linspace(-10, blade, 9)
         share = np.clip(x / blade, 0, 1)
         edge = np.column_stack(
@@ -158,7 +157,7 @@ def dustpan(rng: np.random.Generator, style: int) -> Solid:
         hull_prism([(-x, 0), (-x, h), (-x + 30, h), (x, 4), (x, 0)], s * y - wall / 2, s * y + wall / 2)
         for s in (-1, 1)
     ]
-    back = brick(wall / 2, y, h).moved((-x, 0, 0))
+    back = hull_prism([(-x - 1, 0), (-x - 1, h), (-x + 2, h), (-x + 2, 0)], -y, y)
     path = [(-x + 1, h - 6), (-x - 30, h - 3, 20), (-x - u(105, 125), h + 4)]
     handle = grip(path, [20, 13, 12, 14, 13], [5, 5.5, 6.5, 7, 6])
     return union(floor, *sides, back, handle)
@@ -184,7 +183,7 @@ def _neck(length: Number, height: Number, thick: Number, flare: Number, neck: Nu
 
 def _dish(long: Number, wide: Number, depth: Number, thick: Number, egg: Number) -> Solid:
     """The bowl of a spoon: a sheet over an egg-shaped outline, its rim level, its lowest point at z = 0."""
-    angle = np.linspace(0.13 * np.pi, 0.93 * np.pi, 21)
+    angle = np.linspace(0.09 * np.pi, 0.93 * np.pi, 21)
     x = -np.cos(angle)
     half = wide * np.sin(angle) * (1 - egg * x)
     across = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 17))
@@ -194,7 +193,7 @@ def _dish(long: Number, wide: Number, depth: Number, thick: Number, egg: Number)
     lower[..., 1] = half[:, None] * across
     lower[..., 2] = depth - dip
     upper = lower + np.array([0, 0, thick])
-    return sheet(upper, lower, (4, 3))
+    return sheet(upper, lower, (5, 3))
 
 
 def _table_knife(rng: np.random.Generator, butter: bool) -> Solid:

@@ -6,24 +6,23 @@ sagitta; moved outwards by half of that, it is wrong by as much on both sides.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from dexzoo.sim.objects import Mesh
-from dexzoo.sim.shapes.curves import Array, Number, divided, normals
-from dexzoo.sim.shapes.solid import Solid, convex_parts, hull, skin
+from dexzoo.sim.shapes.curves import Array, Number, divided, ellipse, normals
+from dexzoo.sim.shapes.solid import Solid, convex_parts, exit_distance, hull, skin, turned
 
-Warp = Callable[[Array], Array]
 _FEWEST = 4
 _GOAL = 1.1
 """Deviation below which a wall is not cut any finer."""
 _THINNEST = 0.7
 _COLUMNS = 48
-_SPACING = 6.0
+_SPACING = 10.0
+_SHARP = 0.8
+"""Rounding between wall and floor that is left out inside: a wall's block could not follow it."""
 _RIM = np.sqrt(1 - np.array([0.5, 0.85, 0.985]) ** 2)
 
 
@@ -31,15 +30,16 @@ _RIM = np.sqrt(1 - np.array([0.5, 0.85, 0.985]) ** 2)
 class Wall:
     """A wall of revolution: profiles (row, 2) of radii and heights, outside and inside, row by row across from it.
 
-    warp: moves points (..., 3) of the round wall, for instance to form a lip.
+    lip: how far it is drawn out along -x at its rim; lip_width: the angle on each side of -x over which it is.
     """
 
     outer: Array
     inner: Array
-    warp: Warp
+    lip: Number = 0
+    lip_width: float = 1.0
 
     @classmethod
-    def along(cls, profile: Array, thickness: Number, warp: Warp = lambda points: points) -> Wall:
+    def along(cls, profile: Array, thickness: Number, lip: Number = 0) -> Wall:
         """The wall whose outer side is the profile, its rim rounded."""
         aside = normals(profile)
         inner = profile - thickness * aside
@@ -47,7 +47,7 @@ class Wall:
         middle = (profile[-1] + inner[-1]) / 2
         rise = np.sqrt(1 - _RIM**2)[:, None] * along
         half = _RIM[:, None] * aside[-1] * thickness / 2
-        return cls(np.concatenate((profile, middle + half + rise)), np.concatenate((inner, middle - half + rise)), warp)
+        return cls(np.concatenate((profile, middle + half + rise)), np.concatenate((inner, middle - half + rise)), lip)
 
     def cut(self, height: Number) -> tuple[Wall, int]:
         """The wall with a row whose inner side is at that height, above which it does not come back; and the row."""
@@ -57,7 +57,7 @@ class Wall:
             np.insert(side, row + 1, (1 - share) * side[row] + share * side[row + 1], axis=0)
             for side in (self.outer, self.inner)
         )
-        return Wall(outer, inner, self.warp), row + 1
+        return replace(self, outer=outer, inner=inner), row + 1
 
     def sides(self, angles: Array, rows: slice = slice(None)) -> tuple[Array, Array]:
         """Points (row, angle, 3) outside and inside."""
@@ -67,34 +67,46 @@ class Wall:
             points = np.empty((len(profile), len(angles), 3))
             points[..., :2] = profile[:, None, :1] * directions
             points[..., 2] = profile[:, None, 1]
-            return self.warp(points)
+            points[..., 0] -= self.lip * aside * rise[:, None]
+            return points
 
+        away = np.abs(np.mod(angles, 2 * np.pi) - np.pi)
+        aside = np.clip(1 - away / self.lip_width, 0, 1)
+        base, top = self.lip_base, self.outer[-1, 1]
+        rise = np.clip((self.outer[rows, 1] - base) / (top - base), 0, 1)
         return surface(self.outer[rows]), surface(self.inner[rows])
 
+    @property
+    def lip_base(self) -> float:
+        """The height from which on the lip is drawn out."""
+        low, high = self.outer[[0, -1], 1]
+        return float(low + 0.6 * (high - low))
 
-def vessel(
-    profile: Array, thickness: Number, budget: int, floor: Number | None = None, warp: Warp | None = None
-) -> Solid:
+
+def vessel(profile: Array, thickness: Number, budget: int, floor: Number | None = None, lip: Number = 0) -> Solid:
     """An open vessel of revolution around z.
 
     profile: radii and heights (row, 2) of its outer side, upwards. floor: thickness of its bottom, by default that of
-    the wall. budget: number of parts at most.
+    the wall. budget: number of parts at most. lip: how far the rim is drawn out along -x, for pouring.
     """
-    wall = Wall.along(divided(profile, _SPACING), thickness, warp or (lambda points: points))
+    wall = Wall.along(divided(profile, _SPACING), thickness, lip)
     level = wall.outer[0, 1] + (thickness if floor is None else floor)
-    wall, first = wall.cut(level + 0.3)
+    wall, first = wall.cut(level + _SHARP)
     wall.inner[first, 1] = level
+    below = np.concatenate((wall.outer[: first + 1], wall.inner[first : first + 1]))
+    bottom = convex_parts(turned(below, ellipse(count=_COLUMNS)))
+    room = budget - len(bottom) - (2 if lip else 0)
+    cuts, counts = _layout(wall, first, room)
+    wall = replace(wall, lip_width=2 * np.pi / counts[-1])
     outer, inner = wall.sides(2 * np.pi * np.arange(_COLUMNS) / _COLUMNS)
-    mesh = skin(np.concatenate((outer, inner[first:][::-1])))
-    bottom = convex_parts(np.concatenate((outer[: first + 1], inner[first : first + 1])))
-    return Solid(mesh, bottom + _sectors(wall, first, budget - len(bottom)))
+    return Solid(skin(np.concatenate((outer, inner[first:][::-1]))), bottom + _sectors(wall, cuts, counts))
 
 
 def pipe(profile: Array, thickness: Number, budget: int) -> Solid:
     """A wall of revolution that is open at both ends."""
     wall = Wall.along(divided(profile, _SPACING), thickness)
     outer, inner = wall.sides(2 * np.pi * np.arange(_COLUMNS) / _COLUMNS)
-    return Solid(skin(np.concatenate((outer, inner[::-1])), closed=True), _sectors(wall, 0, budget))
+    return Solid(skin(np.concatenate((outer, inner[::-1])), closed=True), _sectors(wall, *_layout(wall, 0, budget)))
 
 
 def sheet(upper: Array, lower: Array, pieces: tuple[int, int]) -> Solid:
@@ -102,45 +114,44 @@ def sheet(upper: Array, lower: Array, pieces: tuple[int, int]) -> Solid:
     mesh = skin(np.concatenate((lower, upper[:, ::-1]), 1))
     cuts = [np.linspace(0, n - 1, k + 1).round().astype(int) for n, k in zip(lower.shape, pieces, strict=False)]
     parts = [
-        _block(lower[a : b + 1, c : d + 1], upper[a : b + 1, c : d + 1])[0]
+        _block(lower[a : b + 1, c : d + 1], upper[a : b + 1, c : d + 1])
         for a, b in pairwise(cuts[0])
         for c, d in pairwise(cuts[1])
     ]
     return Solid(mesh, parts)
 
 
-def _block(outer: Array, inner: Array) -> tuple[Mesh, float]:
-    """A convex block between two grids (..., 3), and by how much it misses them."""
+def _block(outer: Array, inner: Array) -> Mesh:
+    """A convex block between two grids (..., 3)."""
     across = outer - inner
     thickness = np.linalg.norm(across, axis=-1, keepdims=True)
     across = across / thickness
     out, within = _sagitta(outer, inner, across)
     room = max(float(thickness.max()) - _THINNEST, 1e-3)
     share = min(1.0, 2 * room / max(out + within, 1e-9)) / 2
-    part = hull(np.stack((outer - share * out * across, inner + share * within * across)))
-    return part, (1 - share) * max(out, within)
+    return hull(np.stack((outer - share * out * across, inner + share * within * across)))
 
 
 def _sagitta(outer: Array, inner: Array, across: Array) -> tuple[float, float]:
     """How far the hull of both grids stands out beyond each, along the direction across."""
-    planes = ConvexHull(np.concatenate((outer.reshape(-1, 3), inner.reshape(-1, 3)))).equations
-    away = []
-    for points, direction in ((outer, across), (inner, -across)):
-        height = -(points.reshape(-1, 3) @ planes[:, :3].T + planes[:, 3])
-        speed = direction.reshape(-1, 3) @ planes[:, :3].T
-        leave = np.where(speed > 1e-6, height / np.maximum(speed, 1e-6), np.inf)
-        away.append(max(0.0, float(leave.min(1).max())))
-    return away[0], away[1]
+    outer, inner, across = (grid.reshape(-1, 3) for grid in (outer, inner, across))
+    cloud = np.concatenate((outer, inner))
+    return float(exit_distance(cloud, outer, across).max()), float(exit_distance(cloud, inner, -across).max())
 
 
-def _sectors(wall: Wall, first: int, budget: int) -> list[Mesh]:
-    """The wall from a row on, cut into at most so many blocks: bands one above the other, sectors around."""
-    cuts, counts = _layout(wall, first, budget)
+def _sectors(wall: Wall, cuts: tuple[int, ...], counts: tuple[int, ...]) -> list[Mesh]:
+    """The wall cut into blocks: bands between rows, so many sectors around each, two of which meet at a lip's tip.
+
+    What belongs to the lip is cut at its base, too.
+    """
+    base = int(np.searchsorted(wall.outer[:, 1], wall.lip_base))
     parts = []
     for (low, high), count in zip(pairwise(cuts), counts, strict=True):
-        for start in 2 * np.pi * np.arange(count) / count:
-            angles = start + np.linspace(0, 2 * np.pi / count, 5)
-            parts.append(_block(*wall.sides(angles, slice(low, high + 1)))[0])
+        for sector in range(count):
+            angles = np.pi + 2 * np.pi / count * (sector + np.linspace(0, 1, 5))
+            split = wall.lip and sector in (0, count - 1) and low < base < high
+            for rows in pairwise((low, base, high) if split else (low, high)):
+                parts.append(_block(*wall.sides(angles, slice(rows[0], rows[1] + 1))))
     return parts
 
 

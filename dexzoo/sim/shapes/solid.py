@@ -15,8 +15,11 @@ from scipy.spatial import ConvexHull
 from dexzoo.sim.objects import Mesh
 from dexzoo.sim.shapes.curves import Array, Number, ellipse
 
-TOLERANCE = 1.4
-"""How deep below the surface of a convex part the true surface of a loft may lie."""
+TOLERANCE = 1.3
+"""How far a convex part may stand out beyond the surface of its loft."""
+
+_FLAT = 0.05
+"""Thickness of sections in a row, in the sense of a standard deviation, that make no part."""
 
 
 @dataclass(frozen=True)
@@ -79,31 +82,49 @@ def loft(sections: Array, closed: bool = False, tolerance: Number = TOLERANCE) -
 
 
 def convex_parts(sections: Array, closed: bool = False, tolerance: Number = TOLERANCE) -> list[Mesh]:
-    """Hulls of as many sections in a row as leave none deeper than the tolerance below the surface."""
+    """Hulls of as many sections in a row as stand out beyond their surface by no more than the tolerance."""
+    normals = skin(sections, closed).vertex_normals[: sections.shape[0] * sections.shape[1]].reshape(sections.shape)
     if closed:
-        sections = np.concatenate((sections, sections[:1]))
+        sections, normals = (np.concatenate((each, each[:1])) for each in (sections, normals))
     parts, start, last = [], 0, len(sections) - 1
     while start < last:
         good, bad = start + 1, last + 1
+        while good < last and _is_flat(sections[start : good + 1]):
+            good += 1
         trial = last
-        while bad - good > 0 and good < last:
-            if _depth(sections[start : trial + 1]) <= tolerance:
+        while trial > good:
+            if _excess(sections[start : trial + 1], normals[start : trial + 1]) <= tolerance:
                 good = trial
             else:
                 bad = trial
             trial = (good + bad) // 2
-            if trial == good:
-                break
-        parts.append(hull(sections[start : good + 1]))
+        if not _is_flat(sections[start : good + 1]):
+            parts.append(hull(sections[start : good + 1]))
         start = good
     return parts
 
 
-def _depth(sections: Array) -> float:
-    """How deep the deepest point of the sections lies in their hull."""
-    points = sections[:, ::2].reshape(-1, 3)
-    planes = ConvexHull(points).equations
-    return float((-(points @ planes[:, :3].T + planes[:, 3]).max(1)).max())
+def _excess(sections: Array, normals: Array) -> float:
+    """How far the hull of sections stands out beyond them, along their normals."""
+    if _is_flat(sections):
+        return 0.0
+    some = slice(None, None, max(1, sections.shape[1] // 16))
+    points = sections[:, some].reshape(-1, 3)
+    return float(exit_distance(points, points, normals[:, some].reshape(-1, 3)).max())
+
+
+def _is_flat(sections: Array) -> bool:
+    points = sections.reshape(-1, 3)
+    return bool(np.linalg.svd(points - points.mean(0), compute_uv=False)[2] < _FLAT * np.sqrt(len(points)))
+
+
+def exit_distance(cloud: Array, points: Array, directions: Array) -> Array:
+    """How far each point (n, 3) in the hull of a cloud is from leaving it along its direction (n, 3)."""
+    planes = ConvexHull(cloud).equations
+    height = np.maximum(-(points @ planes[:, :3].T + planes[:, 3]), 0)
+    speed = directions @ planes[:, :3].T
+    distance = np.where(speed > 1e-6, height / np.maximum(speed, 1e-6), np.inf)
+    return np.asarray(distance.min(1), np.float64)
 
 
 def turned(profile: Array, section: Array | None = None, exponent: Array | None = None) -> Array:

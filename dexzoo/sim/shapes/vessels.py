@@ -6,7 +6,7 @@ import numpy as np
 
 from dexzoo.sim.shapes.curves import Array, Number, rounded
 from dexzoo.sim.shapes.handles import ear, grip, radius_at
-from dexzoo.sim.shapes.shell import Warp, pipe, vessel
+from dexzoo.sim.shapes.shell import pipe, vessel
 from dexzoo.sim.shapes.solid import Solid, loft, turned, union
 
 
@@ -23,11 +23,10 @@ def bowl(rng: np.random.Generator, style: int) -> Solid:
         r, h, foot = u(60, 74), u(52, 64), u(25, 30)
         return vessel(rounded([(5, 0), (foot, 0, 1), (foot, 6, 1), (0.6 * r, 0.3 * h, 12), (r, h)]), u(3, 4), 24, 10)
     if kind == "mixing":
-        r, h, foot = u(62, 72), u(50, 62), u(34, 40)
-        rim = [(r, h - 4, 3), (r + 4, h - 1)]
-        return vessel(rounded([(5, 0), (foot, 0, 3), (0.84 * r, 0.3 * h, 25), *rim]), 3, 24)
+        r, h, foot = u(60, 70), u(50, 60), u(34, 38)
+        return vessel(rounded([(5, 0), (foot, 0, 3), (0.82 * r, 0.35 * h, 12), (r, h)]), u(2.8, 3.4), 24)
     if kind == "deep":
-        r, h, foot = u(52, 60), u(62, 75), u(28, 34)
+        r, h, foot = u(47, 55), u(58, 70), u(28, 33)
         return vessel(
             rounded([(5, 0), (foot, 0, 1), (foot, 4, 2), (0.98 * r, 0.3 * h, 24), (r, h)]), u(3.5, 4.5), 24, 8
         )
@@ -44,7 +43,7 @@ def cup(rng: np.random.Generator, style: int) -> Solid:
         return vessel(rounded([(5, 0), (u(0.82, 1) * r, 0, 4), (r, h)]), u(2.5, 3.5), 22, u(5, 10))
     if kind == "paper":
         r, h = u(36, 42), u(90, 120)
-        return vessel(rounded([(5, 0), (0.68 * r, 0), (r, h - 3), (r + 2, h, 1)]), 2.2, 22)
+        return vessel(rounded([(5, 0), (0.68 * r, 0), (r, h - 3), (r + 1.2, h)]), 2.2, 24)
     if kind == "beaker":
         r, h = u(35, 41), u(80, 110)
         return vessel(rounded([(5, 0), (0.8 * r, 0, 6), (0.92 * r, 0.7 * h, 10), (r, h)]), 2.5, 24)
@@ -102,17 +101,21 @@ def jug(rng: np.random.Generator, style: int) -> Solid:
     """Measuring jugs, pitchers, creamers and water jugs, with a lip and a handle."""
     u = rng.uniform
     kind = ("measuring", "pitcher", "creamer", "water")[style % 4]
-    r, h = {"measuring": (u(43, 50), u(90, 115)), "creamer": (u(33, 38), u(68, 85))}.get(kind, (u(42, 47), u(130, 165)))
+    r, h = {
+        "measuring": (u(43, 50), u(90, 115)),
+        "creamer": (u(33, 38), u(68, 85)),
+        "pitcher": (u(35, 39), u(115, 135)),
+    }.get(kind, (u(40, 44), u(125, 155)))
     side = {
         "measuring": [(0.82 * r, 0, 5), (r, h)],
-        "pitcher": [(0.8 * r, 0, 4), (1.02 * r, 0.38 * h, 20), (0.76 * r, h)],
+        "pitcher": [(0.84 * r, 0, 4), (1.02 * r, 0.38 * h, 14), (0.8 * r, h)],
         "creamer": [(0.85 * r, 0, 4), (r, 0.42 * h, 15), (0.8 * r, h)],
         "water": [(r, 0, 5), (0.8 * r, h)],
     }[kind]
     profile, wall = rounded([(5, 0), *side]), u(3, 3.8)
     reach = u(0.5, 0.62) * r if kind == "creamer" else u(32, 42)
     loop = _loop(profile, wall, 0.84 * h, 0.22 * h, reach, (u(6, 8), u(4, 5.5)), u(14, 45), u(0.75, 1.0))
-    return union(vessel(profile, wall, 24 - len(loop.parts), warp=_lip(u(8, 11), h)), loop)
+    return union(vessel(profile, wall, 24 - len(loop.parts), lip=u(6, 8)), loop)
 
 
 def plate(rng: np.random.Generator, style: int) -> Solid:
@@ -173,17 +176,3 @@ def _loop(
     """A handle whose ends lie inside of the wall."""
     a, b = (radius_at(profile[1:], z) - wall / 2 for z in (high, low))
     return ear((a, high), (b, low), reach, *size, bend, taper)
-
-
-def _lip(length: Number, height: Number) -> Warp:
-    """A pouring lip along -x: the wall is drawn out within 30 degrees of it, towards the rim."""
-
-    def warp(points: Array) -> Array:
-        angle = np.arctan2(points[..., 1], -points[..., 0])
-        aside = np.clip(1 - np.abs(angle) / np.deg2rad(36), 0, 1)
-        up = np.clip((points[..., 2] / height - 0.55) / 0.45, 0, 1.1)
-        moved = points.copy()
-        moved[..., 0] -= length * aside * up
-        return moved
-
-    return warp

@@ -1,0 +1,67 @@
+"""How well an object's convex parts, which the hand touches, fit its mesh, which the camera sees."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from dexzoo.sim.objects import ObjectModel
+
+Array = NDArray[np.float64]
+_PROBE = 1e-4  # m in front of a part's face: what lies in another part there is no surface of the whole
+_NEIGHBOURS = 8
+_REFERENCES = 24_000  # points to measure to: a triangle that none falls on is not measured to
+
+
+def surface_distance(model: ObjectModel, num_points: int = 4000, seed: int = 0) -> float:
+    """Two-sided Hausdorff distance (m) between the mesh and the surface of the union of the convex parts.
+
+    From num_points points drawn on each surface, inner walls included, to the nearest triangles of the other one; it
+    can miss a spot that no point falls on.
+    """
+    seen, seen_triangles = _draw(model.mesh, _REFERENCES, seed)
+    area = sum(part.area for part in model.hulls)
+    touched, touched_triangles = [], []
+    for index, part in enumerate(model.hulls):
+        points, triangles, ahead = _draw_ahead(part, 50 + int(1.5 * _REFERENCES * part.area / area), seed + index)
+        outside = ~covered(model, ahead)
+        touched.append(points[outside])
+        touched_triangles.append(triangles[outside])
+    skin, skin_triangles = np.concatenate(touched), np.concatenate(touched_triangles)
+    few = np.random.default_rng(seed).permutation(min(len(skin), len(seen)))[:num_points]
+    return max(_farthest(skin[few], seen, seen_triangles), _farthest(seen[few], skin, skin_triangles))
+
+
+def covered(model: ObjectModel, points: Array) -> NDArray[np.bool_]:
+    """Which points (n, 3), in m, lie in a convex part."""
+    inside = np.zeros(len(points), bool)
+    for part in model.hulls:
+        low, high = part.bounds
+        near = np.flatnonzero(~inside & (points > low).all(1) & (points < high).all(1))
+        normals = part.face_normals
+        offsets = (part.triangles[:, 0] * normals).sum(1)
+        inside[near] = (points[near] @ normals.T - offsets < 1e-9).all(1)
+    return inside
+
+
+def _draw(mesh: trimesh.Trimesh, num: int, seed: int) -> tuple[Array, Array]:
+    """Points (n, 3) on a mesh and their triangles (n, 3, 3)."""
+    points, faces = trimesh.sample.sample_surface(mesh, num, seed=seed)
+    return np.asarray(points), np.asarray(mesh.triangles[faces])
+
+
+def _draw_ahead(part: trimesh.Trimesh, num: int, seed: int) -> tuple[Array, Array, Array]:
+    """Points on a part, their triangles, and points a little outside of it."""
+    points, triangles = _draw(part, num, seed)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return points, triangles, points + _PROBE * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _farthest(points: Array, others: Array, triangles: Array) -> float:
+    """Largest distance of points (n, 3) from the nearest of the triangles that others, points on a surface, lie on."""
+    _, near = cKDTree(others).query(points, k=_NEIGHBOURS)
+    repeated = np.repeat(points, _NEIGHBOURS, axis=0)
+    closest = trimesh.triangles.closest_point(triangles[near.ravel()], repeated)
+    return float(np.linalg.norm(closest - repeated, axis=1).reshape(near.shape).min(1).max())
