@@ -61,9 +61,13 @@ def scene_of(name: str) -> Scene:
 
 
 def measure(name: str, num: int, thorough: bool) -> dict[str, np.ndarray]:
-    """Labels and seconds of one object's grasps under all settings; no grasps where the generator finds none."""
-    scene = scene_of(name)
-    grasps = candidates(scene, num)
+    """Labels and seconds of one object's grasps under all settings; none where it cannot be placed, seen or grasped."""
+    try:
+        scene = scene_of(name)
+        grasps = candidates(scene, num)
+    except (RuntimeError, ValueError) as error:
+        sys.stderr.write(f"{error}\n")
+        return {"waypoints": np.zeros((0, 10, 28), np.float32)}
     out = {"waypoints": grasps.waypoints.numpy()}
     if not len(grasps):
         return out
@@ -91,11 +95,8 @@ def elapsed(start: tuple[float, float]) -> np.ndarray:
 def candidates(scene: Scene, num: int) -> Grasps:
     """Grasps of which about half hold: generated ones, and neighbours of those that hold."""
     rng = np.random.default_rng(0)
-    try:
-        observation = scene.observe(seed=0)
-        grasps = HeuristicGenerator().generate(observation, 4 * num, seed=0).to_frame("world", scene.T_world_camera)
-    except (RuntimeError, ValueError):  # nothing found, or not seen
-        return Grasps(torch.zeros(0, 10, 28), "world")
+    observation = scene.observe(seed=0)
+    grasps = HeuristicGenerator().generate(observation, 4 * num, seed=0).to_frame("world", scene.T_world_camera)
     outcomes = trial.run(scene, grasps, HAND)
     held = np.flatnonzero(outcomes.success)
     if len(held):

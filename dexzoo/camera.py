@@ -199,6 +199,19 @@ class Observation:
         T = self.T_world_camera
         return (self.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
+    def would_see(self, points_world: NDArray[np.floating[Any]], margin: float = 0.005) -> NDArray[np.bool_]:
+        """(num_points,) which points of the world would lie in plain view, by `margin` metres in front of what is seen.
+
+        No part of the scene can be there.
+        """
+        T = np.linalg.inv(self.T_world_camera)
+        points = points_world @ T[:3, :3].T + T[:3, 3]
+        column, row = np.round(self.camera.project(points)).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
+        seen = np.zeros(len(points))
+        seen[inside] = self.depth[row[inside], column[inside]]
+        return np.asarray((seen > 0) & (points[:, 2] < seen - margin))
+
     def aimed(self, size: int = IMAGE_SIZE) -> Observation:
         """The view of a camera in the same place that looks at the object's centre, upright.
 
@@ -219,12 +232,14 @@ class Observation:
         table = np.append(self.table[:3] @ turn, self.table[3])
         return Observation(depth, virtual, T, table, mask)
 
-    def image(self) -> Float[Tensor, "2 224 224"]:
+    def image(self, keep_table: bool = False) -> Float[Tensor, "2 224 224"]:
         """What an evaluator sees: the object's depth and its height over the table, metres; 0 at all other pixels.
 
-        Call it on an `aimed` observation.
+        Call it on an `aimed` observation. keep_table: keep all pixels that have a reading; the shipped evaluators
+        were trained without.
         """
-        return torch.from_numpy(np.where(self.mask, np.stack((self.depth, self.height)), 0).astype(np.float32))
+        shown = self.depth > 0 if keep_table else self.mask
+        return torch.from_numpy(np.where(shown, np.stack((self.depth, self.height)), 0).astype(np.float32))
 
 
 def colourise(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view 3 height width"]:
