@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from dexzoo.sim import ObjectModel
+from dexzoo.sim import ObjectModel, objects
 
 box = trimesh.creation.box
 
@@ -139,9 +139,20 @@ def not_finite() -> trimesh.Trimesh:
     return mesh
 
 
+def tilted_square() -> trimesh.Trimesh:
+    corners = np.array([[0, 0, 0], [0.1, 0, 0.02], [0.1, 0.1, 0.02], [0, 0.1, 0]])
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def faceless_vertex() -> trimesh.Trimesh:
+    return trimesh.Trimesh(CUBE.vertices, [[0, 1, 99], [0, 1, 2], [1, 2, 3]], process=False)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: solid(tilted_square()), "mesh object is flat: all its vertices lie in one plane, or nearly so"),
+        (lambda: solid(faceless_vertex()), "mesh object has faces of vertices that do not exist"),
         (lambda: solid(trimesh.Trimesh()), "mesh object is empty"),
         (lambda: solid(not_finite()), "mesh object has vertices that are not finite"),
         (
@@ -188,6 +199,69 @@ def test_bad_files_are_refused_in_one_line(file: str, content: str, message: str
     with pytest.raises(ValueError, match=message) as caught:
         ObjectModel.from_mesh(tmp_path / file)
     assert "\n" not in str(caught.value)
+
+
+def inside_out() -> trimesh.Trimesh:
+    mesh = CUBE.copy()
+    mesh.invert()
+    return mesh
+
+
+def partly_inside_out() -> trimesh.Trimesh:
+    faces = CUBE.faces.copy()
+    faces[::3] = faces[::3, ::-1]
+    return trimesh.Trimesh(CUBE.vertices, faces, process=False)
+
+
+def littered() -> trimesh.Trimesh:
+    """Triangles that share no vertices, some of them twice, some of no area, and a vertex that none uses."""
+    corners = np.vstack((CUBE.triangles.reshape(-1, 3), CUBE.triangles[:2].reshape(-1, 3), [[5.0, 5, 5]]))
+    faces = np.vstack((np.arange(42).reshape(-1, 3), [[0, 0, 1], [3, 3, 3]]))
+    return trimesh.Trimesh(corners, faces, process=False)
+
+
+@pytest.mark.parametrize("make", [inside_out, partly_inside_out, littered])
+def test_what_is_safe_to_mend_is_mended(make: Callable[[], trimesh.Trimesh]) -> None:
+    bad = make()
+    before = bad.faces.copy()
+    model = ObjectModel.from_mesh(bad)
+    assert model.mesh.is_volume
+    assert model.mesh.volume == pytest.approx(1e-3)
+    assert model.radius == pytest.approx(0.05 * 3**0.5)
+    assert len(model.hulls) == 1
+    assert model.hulls[0].volume == pytest.approx(1e-3, rel=0.02)
+    np.testing.assert_array_equal(bad.faces, before, err_msg="the caller's mesh stays as it was")
+
+
+def with_a_fin() -> trimesh.Trimesh:
+    """Three faces meet at one edge."""
+    edge = CUBE.faces[0, :2]
+    return trimesh.Trimesh([*CUBE.vertices, [0.1, 0, 0]], [*CUBE.faces, [*edge, 8]], process=False)
+
+
+def without_a_side() -> trimesh.Trimesh:
+    return trimesh.Trimesh(CUBE.vertices, CUBE.faces[2:], process=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [with_a_fin, without_a_side])
+def test_meshes_that_are_not_closed_are_cut_all_the_same(make: Callable[[], trimesh.Trimesh]) -> None:
+    model = ObjectModel.from_mesh(make())
+    assert 1 <= len(model.hulls) <= 24
+
+
+def test_a_mesh_that_crashes_the_decomposition_takes_nothing_else_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crash = tmp_path / "crash.py"
+    crash.write_text("import os\nos.abort()\n")
+    monkeypatch.setattr(objects, "_DECOMPOSE", crash)
+    with pytest.raises(ValueError, match="mesh object cannot be cut into convex parts by CoACD; repair the mesh, or"):
+        ObjectModel.from_mesh(CUBE)
+    crash.write_text("import time\ntime.sleep(60)\n")
+    monkeypatch.setattr(objects, "PATIENCE", 0.5)
+    with pytest.raises(ValueError, match=r"mesh object keeps CoACD busy for over 0\.5 s; repair the mesh, or give"):
+        ObjectModel.from_mesh(CUBE)
 
 
 def test_missing_files_are_named(tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def test_the_geoms_are_the_shapes_of_hand_yaml(twin: mujoco.MjModel, can_scene: 
                 assert ends == {tuple(np.array(shape["capsule"][key], float)) for key in ("from", "to")}
     counts = sum(len(expected) for expected in shapes.values())
     assert sum(twin.body(link).geomnum[0] for link in shapes) == counts
-    assert twin.ngeom == counts + len(can_scene.object.hulls) + 1, "and the table"
+    assert twin.ngeom == counts + len(can_scene.object.hulls) + 1, "the can's parts and the table"
 
 
 def test_palm_and_proximal_links_do_not_touch(twin: mujoco.MjModel, hand: Hand) -> None:

@@ -39,7 +39,9 @@ class Demonstration:
     surface: Features
 
     @classmethod
-    def record(cls, grasp: Grasps, mesh: trimesh.Trimesh, hand: Hand, name: str = "", object_name: str = "") -> Demonstration:
+    def record(
+        cls, grasp: Grasps, mesh: trimesh.Trimesh, hand: Hand, name: str = "", object_name: str = ""
+    ) -> Demonstration:
         """From a grasp in the frame of a watertight mesh.
 
         Raises ValueError when the hand touches nothing at the grip.
@@ -51,7 +53,9 @@ class Demonstration:
         distance = hand.signed_distance(links, torch.tensor(np.array(points))).amin(0)
         near = np.asarray(distance < REACH)
         if near.sum() < 10 or distance.min() > 0.005:
-            raise ValueError(f"demonstration {name}: the hand is {float(distance.min()) * 1000:.0f} mm from the object at the grip")
+            raise ValueError(
+                f"demonstration {name}: the hand is {float(distance.min()) * 1000:.0f} mm from the object at the grip"
+            )
         return cls(
             name or GRASP_TYPES[int(grasp.grasp_type[0])],
             object_name,

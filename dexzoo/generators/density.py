@@ -169,7 +169,9 @@ class GraspDensity:
         middle = self.hand.reduce(self.grip[rows] + t[:, None] * self.closing[rows])
         noise = torch.randn(len(rows), len(self.hand.freedoms), generator=generator)
         free = self.hand.clamp(middle + self.widths.joint * noise)
-        relative = self.hand.forward_kinematics(self.hand.expand(free))[torch.arange(len(rows)), self.links[rows, column]]
+        relative = self.hand.forward_kinematics(self.hand.expand(free))[
+            torch.arange(len(rows)), self.links[rows, column]
+        ]
         wrist = pose_matrix(position, rotation.normalize(quaternion)) @ torch.linalg.inv(relative)
         return Grips(rows, wrist, free)
 

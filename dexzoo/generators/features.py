@@ -105,7 +105,9 @@ class Features:
         centred = (offset - mean[:, None]) * np.sqrt(weight)[..., None]
         spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
         normal = axes[:, :, 0] * np.sign(np.einsum("ni,ni->n", axes[:, :, 0], outward) + 1e-12)[:, None]
-        good = (weight.sum(1) >= 8) & (spread[:, 0] < MAX_FLATNESS * spread[:, 2]) & (spread[:, 1] > 1e-3 * spread[:, 2])
+        good = (
+            (weight.sum(1) >= 8) & (spread[:, 0] < MAX_FLATNESS * spread[:, 2]) & (spread[:, 1] > 1e-3 * spread[:, 2])
+        )
         x, y = axes[:, :, 2], np.cross(normal, axes[:, :, 2])
         # height over the tangent plane as a quadric: h = (a u^2 + 2 b u v + c v^2) / 2 + tilt + offset
         u, v, h = (np.einsum("nki,ni->nk", offset, axis) / RADIUS for axis in (x, y, normal))

@@ -67,7 +67,9 @@ class KopickiGenerator(GraspGenerator):
         if self.completes:
             surface = surface.completed(observation)
         generator = torch.Generator().manual_seed(seed)
-        return GraspDensity(self.demonstrations, self.models, surface, self.hand, self.num_kernels, self.widths, generator=generator)
+        return GraspDensity(
+            self.demonstrations, self.models, surface, self.hand, self.num_kernels, self.widths, generator=generator
+        )
 
     def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
         """At most `num_grasps` grasps in the camera frame, the likeliest first, at most `num_per_type` of each type.
@@ -120,7 +122,15 @@ class Way:
         back = wrist[:, 0, :3, 3] - grips.wrist[:, :3, 3]
         length = back.norm(dim=-1).clamp_min(1e-6)
         share = ((MAX_REACH - far) / length).clamp(0, 1)
-        start = torch.cat((wrist[:, 0, :, :3], torch.cat((grips.wrist[:, :3, 3] + share[:, None] * back, torch.ones_like(share)[:, None]), -1)[..., None]), -1)
+        start = torch.cat(
+            (
+                wrist[:, 0, :, :3],
+                torch.cat((grips.wrist[:, :3, 3] + share[:, None] * back, torch.ones_like(share)[:, None]), -1)[
+                    ..., None
+                ],
+            ),
+            -1,
+        )
         shown = self.joints[grips.demo]
         joints = torch.stack((shown[:, 0], grips.joints, self.hand.clamp(grips.joints + shown[:, 2] - shown[:, 1])), 1)
         return torch.cat((start[:, None], wrist[:, 1:]), 1), joints

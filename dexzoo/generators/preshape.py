@@ -53,7 +53,9 @@ def read_preshapes(path: str | Path, hand: Hand) -> list[Preshape]:
         raise FileNotFoundError(f"file of preshapes {path} does not exist")
     entries = yaml.safe_load(Path(path).read_text())
     if not isinstance(entries, dict):
-        raise ValueError(f"{path} holds no preshapes; it maps names of grasp types to object, wrist, open, closed, approach")
+        raise ValueError(
+            f"{path} holds no preshapes; it maps names of grasp types to object, wrist, open, closed, approach"
+        )
     return [_read(name, entry, hand, f"{path}: preshape {name}") for name, entry in entries.items()]
 
 
@@ -72,7 +74,9 @@ def _read(name: str, entry: dict[str, Any], hand: Hand, where: str) -> Preshape:
         pose = pose_matrix(torch.tensor(wrist["position"], dtype=torch.float32), quaternion)
         return Preshape(GRASP_TYPES.index(name), str(entry["object"]), pose, *postures, approach)
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{where} lacks or misspells {error}; it needs object, wrist, open, closed, approach") from None
+        raise ValueError(
+            f"{where} lacks or misspells {error}; it needs object, wrist, open, closed, approach"
+        ) from None
 
 
 def close(preshape: Preshape, mesh: trimesh.Trimesh, hand: Hand) -> Grasps:

@@ -52,9 +52,7 @@ def climb(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int) -> Gr
         return moved()
 
 
-def anneal(
-    density: GraspDensity, grips: Grips, cost: Cost, num_steps: int, generator: torch.Generator
-) -> Grips:
+def anneal(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int, generator: torch.Generator) -> Grips:
     """Simulated annealing with Kopicki's schedule: the temperature falls linearly from 1 to 0.1, and with it the steps."""
     count = len(grips.demo)
     value = near = None

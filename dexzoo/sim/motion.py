@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from dexzoo import rotation
-from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE, Grasps, pose_matrix
+from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE, Grasps
 from dexzoo.hand import Hand
 
 APPROACH_DISTANCE = 0.05
@@ -44,21 +44,13 @@ class Motion:
         wrist[..., 2] += torch.tensor(LIFT_HEIGHT * rise**2 * (3 - 2 * rise))
         return wrist.numpy(), turn.numpy(), angles.numpy()
 
-    def touches_table(self, hand: Hand, steps: int = 4) -> NDArray[np.bool_]:
-        """Whether the path from the approach to the grip meets the table (z = 0), by the hand's own geometry.
-
-        steps: postures looked at between two waypoints.
-        """
+    def closing(self, steps: int = 4) -> tuple[Array, Array, Array]:
+        """All grasps at the approach, and then `steps` times between two waypoints up to the grip; as `at`."""
         keys = np.concatenate(([0.0], np.arange(GRIP * steps + 1) / steps + 1))  # 0 is the approach
         wrist, turn, angles = self._interpolate(keys, np.arange(len(self._position)))
-        links = hand.forward_kinematics(angles)
-        table = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
-        low = hand.clearance(pose_matrix(wrist, turn)[:, :, None] @ links, table).amin((-1, -2))
-        return np.asarray((low < 0).numpy())
+        return wrist.numpy(), turn.numpy(), angles.numpy()
 
-    def _interpolate(
-        self, keys: Array, ids: NDArray[np.int64]
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _interpolate(self, keys: Array, ids: NDArray[np.int64]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """The path at fractional indices of its eleven points."""
         index = np.minimum(keys.astype(np.int64), self._position.shape[1] - 2)
         t = torch.tensor(keys - index)

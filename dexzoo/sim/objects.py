@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,10 +12,14 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import QhullError
 
 MIN_EXTENT, MAX_EXTENT = 5e-4, 1.0
 MIN_SLIVER = 2e-4
 MAX_FRICTION = 2.0
+PATIENCE = 300.0
+"""Seconds that CoACD may take for one mesh."""
+_DECOMPOSE = Path(__file__).with_name("decompose.py")
 Mesh = trimesh.Trimesh
 
 
@@ -51,16 +58,21 @@ class ObjectModel:
         hulls: its convex parts, as files or meshes; None has them computed by CoACD (Wei et al. 2022), which takes
         seconds to a minute. Parts thinner than 0.2 mm, as decompositions leave them, are dropped.
         name: by default that of the file, or of its folder where the file is called mesh.
-        Raises FileNotFoundError or ValueError for a mesh that is missing, empty, flat, not finite or not in metres.
+        Unused vertices, faces that are double or of no area, and faces of a closed mesh that look inwards are mended;
+        holes and edges of more than two faces are left to CoACD.
+        Raises FileNotFoundError or ValueError for a mesh that is missing, empty, flat, not finite, not in metres or
+        too bad for CoACD.
         """
         label = name or ("object" if isinstance(mesh, Mesh) else _name(Path(mesh)))
         surface = _read(mesh, label)
+        where = label if isinstance(mesh, Mesh) else str(mesh)
         if surface.extents.min() < MIN_EXTENT:
             thin = f"{surface.extents.min() * 1000:.2f} mm thick, expected at least {MIN_EXTENT * 1000:g} mm"
-            raise ValueError(f"mesh {label if isinstance(mesh, Mesh) else mesh} is flat: {thin}")
-        parts = _decompose(surface) if hulls is None else [_read(hull, f"hull of {label}") for hull in hulls]
-        convex = (part.convex_hull for part in parts)
-        solid = tuple(part for part in convex if 2 * part.volume / part.area >= MIN_SLIVER)  # a plate's thickness
+            raise ValueError(f"mesh {where} is flat: {thin}")
+        if not _convex([surface]):
+            raise ValueError(f"mesh {where} is flat: all its vertices lie in one plane, or nearly so")
+        parts = _decompose(surface, where) if hulls is None else [_read(hull, f"hull of {label}") for hull in hulls]
+        solid = _convex(parts)
         if not solid:
             raise ValueError(f"object {label} has no convex parts; give hulls=None to have them computed")
         return cls(label, surface, solid, float(mass), float(friction))
@@ -97,10 +109,10 @@ def _name(path: Path) -> str:
 
 
 def _read(source: str | Path | Mesh, label: str) -> Mesh:
-    """A mesh that has passed the checks, its equal vertices merged where it comes from a file."""
+    """A mesh that has passed the checks, mended."""
     if isinstance(source, Mesh):
         _check(source, label)
-        return source
+        return _mended(source)
     path = Path(source)
     if not path.is_file():
         raise FileNotFoundError(f"mesh {path} does not exist")
@@ -111,12 +123,14 @@ def _read(source: str | Path | Mesh, label: str) -> Mesh:
     if not isinstance(mesh, Mesh):
         raise ValueError(f"mesh {path} holds no triangles")
     _check(mesh, str(path))
-    return mesh.process()
+    return _mended(mesh)
 
 
 def _check(mesh: Mesh, where: str) -> None:
     if len(mesh.faces) == 0 or len(mesh.vertices) < 4:
         raise ValueError(f"mesh {where} is empty")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise ValueError(f"mesh {where} has faces of vertices that do not exist")
     if not np.isfinite(mesh.vertices).all():
         raise ValueError(f"mesh {where} has vertices that are not finite")
     extent = mesh.extents
@@ -124,9 +138,43 @@ def _check(mesh: Mesh, where: str) -> None:
         raise ValueError(f"mesh {where} is {extent.max():.1f} m large and looks like millimetres; divide it by 1000")
 
 
-def _decompose(mesh: Mesh) -> list[Mesh]:
-    import coacd  # slow to import, seldom needed
+def _mended(mesh: Mesh) -> Mesh:
+    """Without what no surface has, and its faces looking outwards where it is closed."""
+    mesh = mesh.copy()
+    mesh.merge_vertices()
+    mesh.update_faces(mesh.unique_faces() & mesh.nondegenerate_faces())
+    mesh.remove_unreferenced_vertices()
+    if mesh.is_watertight and (not mesh.is_winding_consistent or mesh.volume < 0):
+        mesh.fix_normals()
+    return mesh
 
-    coacd.set_log_level("error")
-    parts = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), threshold=0.05, max_convex_hull=24, seed=0)
-    return [Mesh(vertices, faces) for vertices, faces in parts]
+
+def _convex(parts: Sequence[Mesh]) -> tuple[Mesh, ...]:
+    """Convex hulls of the parts, but for those that are thin as a foil."""
+    solid = []
+    for part in parts:
+        try:
+            hull = part.convex_hull
+        except QhullError:  # all in one plane
+            continue
+        if 2 * hull.volume / hull.area >= MIN_SLIVER:  # a plate's thickness
+            solid.append(hull)
+    return tuple(solid)
+
+
+def _decompose(mesh: Mesh, where: str) -> list[Mesh]:
+    """Convex parts, computed in a process of its own, which a bad mesh can crash or keep busy for ever."""
+    advice = "repair the mesh, or give its convex parts as hulls"
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
+        np.savez(source, vertices=mesh.vertices, faces=mesh.faces)
+        try:
+            done = subprocess.run(
+                [sys.executable, "-P", _DECOMPOSE, source, target], capture_output=True, timeout=PATIENCE, check=False
+            )
+        except subprocess.TimeoutExpired:
+            raise ValueError(f"mesh {where} keeps CoACD busy for over {PATIENCE:g} s; {advice}") from None
+        if done.returncode != 0 or not target.exists():
+            raise ValueError(f"mesh {where} cannot be cut into convex parts by CoACD; {advice}")
+        arrays = np.load(target)
+        return [Mesh(arrays[f"vertices_{i}"], arrays[f"faces_{i}"]) for i in range(len(arrays.files) // 2)]

@@ -10,14 +10,13 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import torch
-from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from dexzoo import rotation
 from dexzoo.grasp import Grasps, pose_matrix
 from dexzoo.hand import Hand
-from dexzoo.sim.motion import END, HOLD, LIFT, LIFT_START, Motion
-from dexzoo.sim.robot import to_quaternion
+from dexzoo.sim.execution import Execution, Ids, Variation
+from dexzoo.sim.motion import END, HOLD, LIFT, LIFT_START
 from dexzoo.sim.scene import Scene
 from dexzoo.sim.world import REFERENCE, WORKING, Physics
 
@@ -25,9 +24,7 @@ _LOOK = 0.1  # seconds between looks at who has lost the object
 _LOST = 0.1  # metres, besides the object's radius, that it may stay behind the hand
 _PUSHED = 0.3  # metres, besides these, that it may be off to the side
 _FALLING = 0.2  # m/s of the object at the end, when the hand stands still
-_INSIDE = 0.002  # metres that the hand may overlap the object before it sets out
 _BATCH = 1024  # trials under way at once
-Ids = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class Outcomes:
     """What became of each grasp; all arrays (num_grasps,).
 
     success: the object hung in the hand to the end.
-    collided: the commanded path to the grip meets the table; such a grasp is not executed.
+    collided: the commanded path to the grip meets the table, or a block that stands on it; not executed.
     starts_inside: the hand would stand in the object before it sets out, where no arm can bring it; not executed.
     unstable: the solver diverged, at the reference setting too. None of these three is a success, nor the failure of a
     grasp that was tried.
@@ -65,11 +62,15 @@ class Outcomes:
     @classmethod
     def none(cls, count: int) -> Outcomes:
         """Outcomes of grasps that were not executed."""
-        arrays = {}
-        for field in fields(cls):
-            is_flag = "bool" in str(field.type)
-            arrays[field.name] = np.zeros(count, bool) if is_flag else np.full(count, np.nan, np.float32)
-        return cls(**arrays | {"success_rate": np.zeros(count, np.float32)})
+
+        def flag() -> NDArray[np.bool_]:
+            return np.zeros(count, bool)
+
+        def number(value: float = np.nan) -> NDArray[np.float32]:
+            return np.full(count, value, np.float32)
+
+        flags = flag(), flag(), flag(), flag()
+        return cls(*flags, number(), number(), number(), number(), number(), number(), number(0.0))
 
     @classmethod
     def concatenate(cls, parts: list[Outcomes]) -> Outcomes:
@@ -82,17 +83,6 @@ class Outcomes:
     def __setitem__(self, index: Ids | NDArray[np.bool_] | slice, values: Outcomes) -> None:
         for field in fields(self):
             getattr(self, field.name)[index] = getattr(values, field.name)
-
-
-@dataclass(frozen=True)
-class Variation:
-    """What differs from trial to trial of one scene: mass in kg and friction of the object, each (num_grasps,)."""
-
-    mass: NDArray[np.float64]
-    friction: NDArray[np.float64]
-
-    def __getitem__(self, index: Ids) -> Variation:
-        return Variation(self.mass[index], self.friction[index])
 
 
 def run(
@@ -108,15 +98,15 @@ def run(
     num_threads: 0 uses all cores; the outcomes do not depend on it. variation: None gives all the scene's object as it
     is. A trial that the solver diverges in is repeated at the reference setting.
     """
-    outcomes = Outcomes.none(len(grasps))
-    outcomes.collided[:] = Motion(grasps, hand).touches_table(hand)
-    free = np.flatnonzero(~outcomes.collided)
+    if not len(grasps):
+        return Outcomes.none(0)
     model = scene.model(hand.spec, physics)
+    parts = []
     with _without_log():
-        for chunk in np.array_split(free, -(-len(free) // _BATCH)) if len(free) else []:
+        for chunk in np.array_split(np.arange(len(grasps)), -(-len(grasps) // _BATCH)):
             some = None if variation is None else variation[chunk]
-            execution = Execution(scene, grasps[chunk], hand, model, physics, num_threads, some)
-            outcomes[chunk] = _judge(execution, physics)
+            parts.append(_judge(Execution(scene, grasps[chunk], hand, model, physics, num_threads, some)))
+    outcomes = Outcomes.concatenate(parts)
     again = np.flatnonzero(outcomes.unstable)
     if len(again) and physics != REFERENCE:
         some = None if variation is None else variation[again]
@@ -136,113 +126,18 @@ def _without_log() -> Iterator[None]:
         before.set()
 
 
-class Execution:
-    """Grasps under way on copies of one scene; poses are read from the state of the batch."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        grasps: Grasps,
-        hand: Hand,
-        model: mujoco.MjModel,
-        physics: Physics,
-        num_threads: int,
-        variation: Variation | None = None,
-    ) -> None:
-        self.motion = Motion(grasps, hand)
-        self.physics = physics
-        self.time = 0.0
-        self.batch = Batch(model, max(len(grasps), 1), num_threads)
-        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
-        self.wrist_at, self.object_at = model.joint("wrist").qposadr[0], model.joint("object").qposadr[0]
-        self.object_dof, self.object_body = model.joint("object").dofadr[0], model.body("object").id
-        self.finger_at = [model.joint(name).qposadr[0] for name in hand.joint_names]
-        self.order = [hand.joint_names.index(model.actuator(i).name) for i in range(model.nu)]
-        self.center, self.radius = scene.object.inertia[0], scene.object.radius
-        if variation is not None:
-            self._vary(variation, scene)
-        at = self.object_at
-        self.qpos[:, at : at + 3] = scene.T_world_object[:3, 3]
-        self.qpos[:, at + 3 : at + 7] = to_quaternion(scene.T_world_object[:3, :3])
-        self.everyone = np.arange(len(grasps))
-        wrist, turn, joints = (part[:, 0] for part in self.motion.at(np.zeros(1), self.everyone))
-        at = self.wrist_at
-        self.qpos[: len(grasps), at : at + 7] = np.concatenate((wrist, turn), axis=1)
-        self.qpos[: len(grasps), self.finger_at] = joints
-
-    def _vary(self, variation: Variation, scene: Scene) -> None:
-        """Masses and frictions of each copy's own."""
-        body = self.object_body
-        mass, inertia = self.batch.expand("body_mass"), self.batch.expand("body_inertia")
-        inertia[:, body] *= (variation.mass / mass[:, body])[:, None]
-        mass[:, body] = variation.mass
-        friction = self.batch.expand("geom_friction")
-        geoms = np.flatnonzero(self.batch.model.geom_bodyid == body)
-        friction[:, geoms] *= (variation.friction / scene.object.friction)[:, None, None]
-        self.batch.set_const()
-
-    def advance(self, ids: Ids, until: float) -> None:
-        """Follow the motion up to a time since the start, which must not lie beyond the start of the lift before it."""
-        step = self.physics.timestep if self.time < LIFT_START - 1e-6 else self.physics.carry_timestep
-        times = self.time + step * np.arange(1, round((until - self.time) / step) + 1)
-        if not len(times):
-            return
-        self.batch.expand("opt.timestep")[:] = step
-        wrist, turn, angles = self.motion.at(times, ids)
-        state = mujoco.mjtState
-        spec = state.mjSTATE_CTRL | state.mjSTATE_MOCAP_POS | state.mjSTATE_MOCAP_QUAT
-        commands = np.concatenate((angles[..., self.order], wrist, turn), axis=-1)
-        self.batch.rollout(len(times), commands, int(spec), record=(), ids=ids)
-        self.time = float(times[-1])
-
-    def broken(self, ids: Ids) -> NDArray[np.bool_]:
-        """Whose solver has warned or diverged."""
-        warned = self.batch.warning[ids, :, 1].sum(-1) > 0
-        return np.asarray(warned | ~np.isfinite(self.qpos[ids]).all(-1))
-
-    def wrist(self, ids: Ids) -> NDArray[np.float64]:
-        """(n, 7) poses of the wrist: position and quaternion."""
-        return np.asarray(self.qpos[ids, self.wrist_at : self.wrist_at + 7])
-
-    def object(self, ids: Ids) -> NDArray[np.float64]:
-        """(n, 7) poses of the object: its centre of mass and its quaternion."""
-        pose = self.qpos[ids, self.object_at : self.object_at + 7].copy()
-        pose[:, :3] += rotation.rotate(torch.tensor(pose[:, 3:]), torch.tensor(self.center)).numpy()
-        return pose
-
-    def in_palm(self, ids: Ids) -> NDArray[np.float64]:
-        """(n, 7) poses of the object in the palm frame."""
-        wrist, pose = torch.tensor(self.wrist(ids)), torch.tensor(self.object(ids))
-        inverse = rotation.conjugate(wrist[:, 3:])
-        offset = rotation.rotate(inverse, pose[:, :3] - wrist[:, :3])
-        return torch.cat((offset, rotation.normalize(rotation.multiply(inverse, pose[:, 3:]))), -1).numpy()
-
-    def touch(self, ids: Ids) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Of the contacts between hand and object: deepest overlap in m and sum of normal forces in N, each (n,)."""
-        overlap, force = np.zeros(len(ids)), np.zeros(len(ids))
-        data, wrench = mujoco.MjData(self.batch.model), np.zeros(6)
-        for i, sim in enumerate(ids):
-            model = self.batch.get_model(int(sim))
-            self.batch.get_data(int(sim), data)
-            mujoco.mj_forward(model, data)
-            bodies = model.geom_bodyid[data.contact.geom]
-            for contact in np.flatnonzero((bodies == self.object_body).any(-1) & (bodies > 0).all(-1)):
-                mujoco.mj_contactForce(model, data, int(contact), wrench)
-                overlap[i] = max(overlap[i], -data.contact.dist[contact])
-                force[i] += wrench[0]
-        return overlap, force
-
-
-def _judge(execution: Execution, physics: Physics) -> Outcomes:
-    """Execute and watch."""
-    everyone = execution.everyone
+def _judge(execution: Execution) -> Outcomes:
+    """Execute, look every tenth of a second what has become of each object, and go on with those that may hold."""
+    everyone, stops_early = execution.everyone, execution.physics.stops_early
     out = Outcomes.none(len(everyone))
-    out.starts_inside[:] = execution.touch(everyone)[0] > _INSIDE
-    alive = everyone[~out.starts_inside]
+    out.collided[:], out.starts_inside[:] = execution.obstructed()
+    alive = everyone[~out.collided & ~out.starts_inside]
     rest, gripped = execution.object(everyone), np.zeros((len(everyone), 7))
     wrist_height = np.zeros(len(everyone))
     limit = _LOST + execution.radius
     for look in range(1, round(END / _LOOK) + 1):
+        if not len(alive):
+            break
         time = look * _LOOK
         execution.advance(alive, time)
         broken = execution.broken(alive)
@@ -252,27 +147,29 @@ def _judge(execution: Execution, physics: Physics) -> Outcomes:
         away = np.linalg.norm(pose[:, :2] - wrist[:, :2], axis=1) > limit + _PUSHED
         if look > round(LIFT_START / _LOOK):
             away |= wrist[:, 2] - wrist_height[alive] - (pose[:, 2] - rest[alive, 2]) > limit
-        if physics.stops_early or look == round(END / _LOOK):
+        if stops_early or look == round(END / _LOOK):
             out.lost_at[alive[away]] = time - LIFT_START
             alive = alive[~away]
         if look == round(LIFT_START / _LOOK):
             wrist_height[alive] = execution.wrist(alive)[:, 2]
             gripped[alive] = execution.in_palm(alive)
             _measure(out.closing_shift, out.closing_rotation, alive, execution.object(alive), rest[alive])
-        if not len(alive):
-            break
     speed = np.linalg.norm(execution.qvel[alive, execution.object_dof : execution.object_dof + 3], axis=1)
     out.lost_at[alive[speed > _FALLING]] = LIFT + HOLD
     alive = alive[speed <= _FALLING]
     out.success[alive] = True
     out.success_rate[alive] = 1
-    out.contact_force[alive] = execution.touch(alive)[1]
+    out.contact_force[alive] = execution.contact_force(alive)
     _measure(out.shift, out.rotation, alive, execution.in_palm(alive), gripped[alive])
     return out
 
 
 def _measure(
-    shift: NDArray[np.float32], turned: NDArray[np.float32], ids: Ids, now: NDArray[np.float64], then: NDArray[np.float64]
+    shift: NDArray[np.float32],
+    turned: NDArray[np.float32],
+    ids: Ids,
+    now: NDArray[np.float64],
+    then: NDArray[np.float64],
 ) -> None:
     """Write how far poses (n, 7) have moved and turned."""
     shift[ids] = np.linalg.norm(now[:, :3] - then[:, :3], axis=1)

@@ -17,20 +17,22 @@ from dexzoo.sim.robot import HAND, OBJECT, TABLE, to_quaternion
 class Physics:
     """How finely a trial is simulated.
 
-    timestep: seconds a step until the lift begins. carry_timestep: from then on; what hangs in a hand moves less than
-    what slides as the hand closes. noslip_iterations: sweeps that take the creep out of friction. stops_early: a trial
-    ends once its object is lost.
+    timestep, noslip_iterations: seconds a step, and sweeps that take the creep out of friction, until the lift begins;
+    carry_timestep, carry_noslip_iterations: from then on. As the hand closes things slide and collide, which wants
+    small steps; what hangs in it hardly moves, but is held long enough to creep. stops_early: a trial ends once its
+    object is lost.
     """
 
     timestep: float = 0.002
-    carry_timestep: float = 0.004
     noslip_iterations: int = 0
+    carry_timestep: float = 0.004
+    carry_noslip_iterations: int = 3
     stops_early: bool = True
 
 
 WORKING = Physics()
 """What all labels are made with."""
-REFERENCE = Physics(timestep=0.001, carry_timestep=0.001, noslip_iterations=5, stops_early=False)
+REFERENCE = Physics(0.001, 5, 0.001, 5, stops_early=False)
 """What the labels are compared with."""
 
 
