@@ -20,8 +20,8 @@ from dexzoo.data.schema import GraspSet
 from dexzoo.grasp import Grasps
 from dexzoo.hand import default_hand
 from dexzoo.sim import Scene, trial
-from dexzoo.sim.scene import REFERENCE, WORKING
 from dexzoo.sim.shapes import make_object
+from dexzoo.sim.world import REFERENCE, WORKING
 
 OFFSETS = (0.0001, 0.001, 0.003)
 

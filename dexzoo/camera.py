@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dexzoo import rotation
+from dexzoo.segmentation import fit_table, segment
 
-MAX_DEPTH = 1.4
-"""Readings beyond this many metres count as none (the range of the thesis' sensor)."""
 IMAGE_SIZE = 224
-MIN_HEIGHT = 0.008
-"""Points lower than this above the table, in metres, are taken as table."""
-MAX_HEIGHT = 0.45
-MIN_POINTS = 50
-"""Fewest object points that anything can be inferred from (Kopicki's generator asks as many)."""
 
 
 @dataclass(frozen=True)
@@ -57,20 +51,55 @@ class Camera:
                 raise ValueError(f"{where}: {name} is {value}, expected a positive number")
         return cls(int(values["width"]), int(values["height"]), *(float(values[name]) for name in names[2:]))
 
+    @classmethod
+    def aimed(cls, size: int = IMAGE_SIZE) -> Camera:
+        """That of an aimed view: 460 pixels of f = 574, shrunk to `size` (the thesis' crop, section 3.3)."""
+        focal, middle = 574 * size / 460, (size - 1) / 2
+        return cls(size, size, focal, focal, middle, middle)
+
     @property
     def matrix(self) -> NDArray[np.float64]:
         """(3, 3) intrinsic matrix."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
     def directions(self) -> NDArray[np.float64]:
-        """(height, width, 3) viewing directions with z = 1, camera frame."""
-        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        return np.stack(((u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)), axis=-1)
+        """(height, width, 3) viewing directions with z = 1, camera frame; not to be written to."""
+        return _directions(self)
 
     def project(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """Pixel coordinates (*batch, 2) of points (*batch, 3) in the camera frame."""
         homogeneous = np.asarray(points, np.float64) @ self.matrix.T
         return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+@lru_cache(maxsize=4)
+def _directions(camera: Camera) -> NDArray[np.float64]:
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = np.stack(((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)), axis=-1)
+    rays.setflags(write=False)
+    return rays
+
+
+def upright(forward: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) axes of an upright camera that looks along `forward`: its x level, its y down, its z forward.
+
+    Looking straight along `up` (a unit vector) its x is that of the frame in which both are given.
+    """
+    z = forward / np.linalg.norm(forward)
+    x = np.cross(z, up)
+    if np.linalg.norm(x) < 1e-3:
+        x = np.array([1.0, 0, 0]) - z[0] * z
+    x /= np.linalg.norm(x)
+    return np.column_stack((x, np.cross(z, x), z))
+
+
+def look_at(target: NDArray[np.float64], distance: float, azimuth: float, elevation: float) -> NDArray[np.float64]:
+    """T_world_camera of an upright camera `distance` metres from a target (3,); angles in radians."""
+    back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    pose = np.eye(4)
+    pose[:3, :3] = upright(-back, np.array([0, 0, 1.0]))
+    pose[:3, 3] = np.asarray(target) + distance * back
+    return pose
 
 
 class Observation:
@@ -79,8 +108,8 @@ class Observation:
     depth: (height, width) metres along z; 0 or NaN = no reading.
     T_world_camera: (4, 4) pose of the camera in the world, whose table top is z = 0. Without it, the world is laid
     into the table: z up, origin below the camera, x along the camera's.
-    table: (4,) plane in the camera frame, normal . p + offset = height over the table. Without it and without
-    T_world_camera it is fitted to the image.
+    table: (4,) plane in the camera frame, normal . p + offset = height over the table. Without it, it follows from
+    T_world_camera, or is fitted to the image; given with it, it tells heights, while the pose tells where grasps are.
     mask: (height, width) bool, the object's pixels. Without it, the object is segmented.
 
     Raises ValueError that says what is wrong with the image or that no object is seen.
@@ -97,11 +126,13 @@ class Observation:
         self.camera = camera
         self.depth = _check_depth(depth, camera)
         self.T_world_camera: NDArray[np.float64]
+        self.table: NDArray[np.float64]
         if T_world_camera is not None:
             self.T_world_camera = rotation.check_pose(T_world_camera, "T_world_camera").numpy()
+            self.table = self.T_world_camera[2].copy() if table is None else _check_table(table)
         else:
-            plane = fit_table(self.depth, camera) if table is None else _check_table(table)
-            self.T_world_camera = _pose_over_table(plane)
+            self.table = fit_table(self._cloud[self.depth > 0]) if table is None else _check_table(table)
+            self.T_world_camera = _pose_over_table(self.table)
         if mask is not None and mask.shape != self.depth.shape:
             raise ValueError(f"mask has shape {mask.shape}, expected that of the depth, {self.depth.shape}")
         self._mask = None if mask is None else np.asarray(mask, bool)
@@ -132,10 +163,10 @@ class Observation:
         except ValueError as error:
             raise ValueError(f"{depth}: {error}") from None
 
-    @cached_property
-    def table(self) -> NDArray[np.float64]:
-        """(4,) table plane in the camera frame: normal . p + offset is the height over the table."""
-        return np.append(self.T_world_camera[2, :3], self.T_world_camera[2, 3])
+    @property
+    def _cloud(self) -> NDArray[np.float64]:
+        """(height, width, 3) the point at each pixel in the camera frame; 0 where there is no reading."""
+        return self.camera.directions() * self.depth[..., None]
 
     @cached_property
     def height(self) -> NDArray[np.float32]:
@@ -150,7 +181,7 @@ class Observation:
         Raises ValueError when nothing stands on the table, or a given mask holds no reading.
         """
         if self._mask is None:
-            return segment(self)
+            return segment(self._cloud, self.height)
         seen: NDArray[np.bool_] = self._mask & (self.depth > 0)
         if not seen.any():
             raise ValueError("the object's mask holds no depth reading; check that it belongs to this image")
@@ -171,20 +202,10 @@ class Observation:
     def aimed(self, size: int = IMAGE_SIZE) -> Observation:
         """The view of a camera in the same place that looks at the object's centre, upright.
 
-        Its 460 pixels of f = 574 are shrunk to `size` (the thesis' crop, section 3.3). Turning a camera about its
-        centre loses nothing but pixels.
+        Its camera is `Camera.aimed(size)`. Turning a camera about its centre loses nothing but pixels.
         """
-        zoom = size / 460
-        middle = (size - 1) / 2
-        virtual = Camera(size, size, 574 * zoom, 574 * zoom, middle, middle)
-        gaze = self.points.mean(0, dtype=np.float64)
-        z = gaze / np.linalg.norm(gaze)
-        up = self.table[:3]
-        x = np.cross(z, up)
-        if np.linalg.norm(x) < 1e-3:  # looking straight down: keep the camera's own right
-            x = np.array([1.0, 0, 0]) - z[0] * z
-        x /= np.linalg.norm(x)
-        turn = np.column_stack((x, np.cross(z, x), z))  # T_camera_virtual, rotation only
+        virtual = Camera.aimed(size)
+        turn = upright(self.points.mean(0, dtype=np.float64), self.table[:3])  # T_camera_virtual, rotation only
         pixels = virtual.directions() @ turn.T @ self.camera.matrix.T
         source = (pixels[..., :2] / np.maximum(pixels[..., 2:], 1e-6)).astype(np.float32)
         # range along the ray is what a turn leaves as it is
@@ -195,7 +216,8 @@ class Observation:
         depth = seen / np.linalg.norm(virtual.directions(), axis=-1)
         T = self.T_world_camera.copy()
         T[:3, :3] = T[:3, :3] @ turn
-        return Observation(depth, virtual, T, mask=mask)
+        table = np.append(self.table[:3] @ turn, self.table[3])
+        return Observation(depth, virtual, T, table, mask)
 
     def image(self) -> Float[Tensor, "2 224 224"]:
         """What an evaluator sees: the object's depth and its height over the table, metres; 0 at all other pixels.
@@ -224,96 +246,6 @@ def colourise(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view 
         return value.sign() * value.abs().sqrt()
 
     return torch.stack((depth, compress(mean), compress(compress(gaussian))), dim=1)
-
-
-def add_sensor_noise(
-    depth: NDArray[np.float64], camera: Camera, rng: np.random.Generator, normals: NDArray[np.float64] | None = None
-) -> NDArray[np.float32]:
-    """Depth as a structured-light sensor of 75 mm baseline would read it.
-
-    Gaussian disparity noise of 0.075 pixel on a grid 1.5 times coarser, disparity in steps of 1/8 pixel (the
-    simulator behind the thesis); holes at depth edges and where the surface is seen at less than 12 degrees.
-    normals: (height, width, 3) surface normals in the camera frame, if known.
-    """
-    baseline = 0.075
-    height, width = depth.shape
-    coarse = rng.normal(0, 0.075, (int(height / 1.5), int(width / 1.5))).astype(np.float32)
-    noise = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
-    valid = depth > 0
-    disparity = camera.fx * baseline / np.where(valid, depth, 1.0)
-    disparity = np.round((disparity + noise) * 8) / 8
-    noisy = camera.fx * baseline / np.maximum(disparity, 1e-3)
-    metres = np.where(valid, depth, MAX_DEPTH).astype(np.float32)
-    kernel = np.ones((3, 3), np.uint8)
-    edge = cv2.dilate(metres, kernel) - cv2.erode(metres, kernel) > 0.03
-    valid &= ~(edge & (rng.random(depth.shape) < 0.5))
-    if normals is not None:
-        rays = camera.directions()
-        cosine = np.abs((normals * rays).sum(-1)) / np.linalg.norm(rays, axis=-1)
-        valid &= cosine > np.sin(np.deg2rad(12))
-    return np.where(valid, noisy, 0).astype(np.float32)
-
-
-def fit_table(depth: NDArray[np.floating[Any]], camera: Camera, seed: int = 0) -> NDArray[np.float64]:
-    """The largest plane within 1.4 m, (4,), by RANSAC with a least-squares finish; its normal faces the camera.
-
-    Raises ValueError when fewer than a tenth of the readings lie on one plane.
-    """
-    rng = np.random.default_rng(seed)
-    valid = (depth > 0) & (depth < MAX_DEPTH)  # a wall behind the table may be larger than it
-    cloud = camera.directions()[valid] * depth[valid][:, None]
-    if len(cloud) < MIN_POINTS:
-        raise ValueError(f"fewer than {MIN_POINTS} readings within {MAX_DEPTH} m; check the depth and its scale")
-    sample = cloud[rng.permutation(len(cloud))[:20_000]]
-    triples = sample[rng.integers(len(sample), size=(500, 3))]
-    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-    length = np.linalg.norm(normals, axis=1)
-    normals = normals[length > 1e-8] / length[length > 1e-8, None]
-    offsets = -(normals * triples[length > 1e-8, 0]).sum(1)
-    probe = sample[:2_000]
-    counts = (np.abs(probe @ normals.T + offsets) < 0.006).sum(0)
-    if not counts.size or counts.max() < len(probe) / 10:
-        raise ValueError("no table plane is seen; give table_plane or T_world_camera in the camera file")
-    plane = np.append(normals[counts.argmax()], offsets[counts.argmax()])
-    for _ in range(3):
-        near = sample[np.abs(sample @ plane[:3] + plane[3]) < 0.004]
-        centre = near.mean(0)
-        normal = np.linalg.svd(near - centre, full_matrices=False)[2][2]
-        plane = np.append(normal, -normal @ centre)
-    return plane if plane[3] > 0 else -plane
-
-
-def segment(observation: Observation) -> NDArray[np.bool_]:
-    """The pixels of the one object: those above the table and connected in the image, large and near its middle.
-
-    Raises ValueError when nothing of at least 50 pixels stands on the table.
-    """
-    height, depth = observation.height, observation.depth
-    above = (depth > 0) & (depth < MAX_DEPTH) & (height > MIN_HEIGHT) & (height < MAX_HEIGHT)
-    # closing lets a component reach over a line of lost readings
-    closed = cv2.morphologyEx(above.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    count, labels, stats, centres = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    labels[~above] = 0
-    rows, columns = depth.shape
-    best, best_value = 0, 0.0
-    for label in range(1, count):
-        area = stats[label, cv2.CC_STAT_AREA]
-        offset = np.hypot(centres[label][0] / columns - 0.5, centres[label][1] / rows - 0.5)
-        value = area * np.exp(-0.5 * (offset / 0.2) ** 2)
-        if area >= MIN_POINTS and value > best_value:
-            best, best_value = label, value
-    if best == 0:
-        raise ValueError(
-            "no object is seen above the table within 1.4 m; check the depth, its scale and the table plane"
-        )
-    # parts of one object may be cut apart by a shadow: take in what lies within 2 cm of its box
-    cloud = observation.camera.directions() * depth[..., None]
-    main = labels == best
-    low, high = cloud[main].min(0) - 0.02, cloud[main].max(0) + 0.02
-    near = above & ((cloud >= low) & (cloud <= high)).all(-1)
-    joined = np.unique(labels[near])
-    within = [label for label in joined if label and (near & (labels == label)).sum() > 0.9 * stats[label, 4]]
-    return np.asarray(main | np.isin(labels, within))
 
 
 def _check_depth(depth: NDArray[Any], camera: Camera) -> NDArray[np.float32]:

@@ -113,17 +113,6 @@ def grasp_picture(observation: Observation, hand: Hand, grasp: Grasps) -> Image:
     return grid(pictures, list(moments), columns=3)
 
 
-def look_at(target: NDArray[np.float64], distance: float, azimuth: float, elevation: float) -> NDArray[np.float64]:
-    """T_world_camera of an upright camera `distance` metres from a target; angles in radians."""
-    back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    right = np.cross(-back, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.column_stack((right, np.cross(-back, right), -back))
-    pose[:3, 3] = np.asarray(target) + distance * back
-    return pose
-
-
 def grid(pictures: Sequence[Image], titles: Sequence[str], columns: int) -> Image:
     """Pictures of one size, side by side, each with its title above."""
     cells = []

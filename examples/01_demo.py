@@ -12,6 +12,7 @@ from rich.table import Table
 
 import dexzoo
 from dexzoo import plots
+from dexzoo.camera import look_at
 from dexzoo.grasp import GRASP_TYPES
 from dexzoo.hand import default_hand
 from dexzoo.sim import trial
@@ -67,7 +68,7 @@ def lift_picture(scene: dexzoo.sim.Scene, grasp: dexzoo.Grasps) -> plots.Image:
         mesh = scene.object.mesh.copy().apply_transform(moment.T_world_object)
         solids = [plots.Solid(mesh, plots.OBJECT_COLOUR), plots.hand_solid(hand, moment.waypoint)]
         target = np.array([0, 0, max(0.12, float(moment.waypoint[2]) - 0.08)])
-        pictures.append(plots.render(solids, camera, plots.look_at(target, 0.75, 0.6, 0.3))[0])
+        pictures.append(plots.render(solids, camera, look_at(target, 0.75, 0.6, 0.3))[0])
     return plots.grid(pictures, list(moments), columns=len(moments))
 
 

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from dexzoo import rotation
-from dexzoo.camera import Observation
-from dexzoo.data.schema import AIMED_CAMERA, encode_path, encode_view, merge, write_scene
+from dexzoo.camera import Camera, Observation, look_at
+from dexzoo.data.schema import encode_path, encode_view, merge, write_scene
 from dexzoo.grasp import Grasps
 from dexzoo.hand import default_hand
 
@@ -24,20 +24,14 @@ CLOSED = 0.75
 def camera_pose(centre: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
     """A camera that looks at a point from 0.4 to 0.75 m, 30 to 57 degrees above it, upright."""
     elevation, azimuth = np.deg2rad(rng.uniform(30, 57)), rng.uniform(0, 2 * np.pi)
-    way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    x = np.cross(-way, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack((x, np.cross(-way, x), -way))
-    T[:3, 3] = centre + rng.uniform(0.4, 0.75) * way
-    return T
+    return look_at(centre, rng.uniform(0.4, 0.75), azimuth, elevation)
 
 
 def render(
     shape: str, half: NDArray[np.float64], centre: NDArray[np.float64], T_world_camera: NDArray[np.float64]
 ) -> Observation:
     """The aimed view of a "ball" of radius half[0] or of a "box", by intersecting each pixel's ray."""
-    ray = AIMED_CAMERA.directions() @ T_world_camera[:3, :3].T
+    ray = Camera.aimed().directions() @ T_world_camera[:3, :3].T
     origin = T_world_camera[:3, 3] - centre
     if shape == "ball":
         a, b = (ray * ray).sum(-1), ray @ origin
@@ -48,7 +42,7 @@ def render(
             near = np.minimum((-half - origin) / ray, (half - origin) / ray).max(-1)
             far = np.maximum((-half - origin) / ray, (half - origin) / ray).min(-1)
         depth = np.where(near < far, near, 0)
-    return Observation(depth, AIMED_CAMERA, T_world_camera, mask=depth > 0)
+    return Observation(depth, Camera.aimed(), T_world_camera, mask=depth > 0)
 
 
 def draw_grasps(centre: NDArray[np.float64], count: int, rng: np.random.Generator) -> tuple[Grasps, NDArray[np.bool_]]:

@@ -13,9 +13,9 @@ MODULES = sorted({path.relative_to(PACKAGE).parts[0].removesuffix(".py") for pat
 
 # Each module may import those of the lines above its own, and none of its own line or below.
 LAYERS = [
-    {"rotation", "resources"},
+    {"rotation", "resources", "segmentation"},
     {"grasp", "camera"},
-    {"hand_spec"},
+    {"hand_spec", "sensor"},
     {"kinematics", "geometry"},
     {"hand"},
     {"metrics", "sim", "generators"},

@@ -5,8 +5,8 @@ import pytest
 import torch
 import trimesh
 
-from dexzoo import planning, plots
-from dexzoo.camera import Camera, Observation
+from dexzoo import planning
+from dexzoo.camera import Camera, Observation, look_at
 from dexzoo.generators.heuristic import HeuristicGenerator, complete, spread
 from dexzoo.grasp import GRASP_TYPES, GRIP, PREGRASP, SQUEEZE, Grasps
 from dexzoo.hand import Hand
@@ -170,9 +170,9 @@ def test_no_grasps_cannot_be_asked_for(can_view: Observation, num_grasps: int) -
 
 
 def test_a_thing_larger_than_the_hand_has_no_grasp() -> None:
-    slab = trimesh.creation.box([0.3, 0.3, 0.1])
+    slab = trimesh.creation.box([0.3, 0.3, 0.15])
     scene = Scene.place(ObjectModel.from_mesh(slab, hulls=[slab]))
-    pose = plots.look_at(np.array([0.0, 0.0, 0.05]), 0.7, 0.4, 0.8)
+    pose = look_at(np.array([0.0, 0.0, 0.05]), 0.7, 0.4, 0.8)
     view = scene.observe(camera=Camera(320, 240, 287.0, 287.0, 160.0, 120.0), T_world_camera=pose)
     with pytest.raises(RuntimeError, match="no feasible grasp is found: the object may be too large, too flat or out"):
         HeuristicGenerator(num_samples=400).generate(view)

@@ -7,7 +7,7 @@ import trimesh
 
 from dexzoo.sim import ObjectModel
 from dexzoo.sim.robot import HAND, OBJECT
-from dexzoo.sim.scene import WORKING, _world
+from dexzoo.sim.world import WORKING, make_world
 
 GRAVITY = 9.81
 EDGE = 0.05
@@ -16,7 +16,7 @@ EDGE = 0.05
 def between_plates(mass: float, friction: float, force: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """A cube held in the air by two plates that are pushed together, each by `force` newtons."""
     cube = trimesh.creation.box([EDGE] * 3)
-    world = _world(ObjectModel("cube", cube, (cube,), mass, friction), WORKING)
+    world = make_world(ObjectModel("cube", cube, (cube,), mass, friction), WORKING)
     for name, side in (("left", -1), ("right", 1)):
         plate = world.worldbody.add_body(name=name, pos=[side * (EDGE / 2 + 0.005), 0, 0.5])
         plate.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-side, 0, 0])

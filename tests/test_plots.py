@@ -9,13 +9,13 @@ import torch
 import trimesh
 
 from dexzoo import plots
-from dexzoo.camera import Camera, Observation
+from dexzoo.camera import Camera, Observation, look_at
 from dexzoo.grasp import GRIP, Grasps
 from dexzoo.hand import Hand
 
 CAMERA = Camera(160, 120, 143.5, 143.5, 80.0, 60.0)
 CENTRE, RADIUS = np.array([0.02, -0.01, 0.05]), 0.05
-POSE = plots.look_at(np.array([0.0, 0.0, 0.03]), 0.5, 0.7, 0.6)
+POSE = look_at(np.array([0.0, 0.0, 0.03]), 0.5, 0.7, 0.6)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_the_nearer_of_two_solids_is_seen(ball: plots.Solid) -> None:
 
 def test_look_at_looks_there_upright() -> None:
     target = np.array([0.1, 0.2, 0.3])
-    T = plots.look_at(target, 0.6, 2.0, 0.5)
+    T = look_at(target, 0.6, 2.0, 0.5)
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
     np.testing.assert_allclose(T[:3, 3] + 0.6 * T[:3, 2], target, atol=1e-12)

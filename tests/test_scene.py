@@ -10,8 +10,7 @@ import torch
 import trimesh
 import yaml
 
-from dexzoo import plots
-from dexzoo.camera import Camera, Observation
+from dexzoo.camera import Camera, Observation, look_at
 from dexzoo.hand import Hand
 from dexzoo.resources import resource
 from dexzoo.sim import ObjectModel, Scene
@@ -265,14 +264,15 @@ def test_ideal_points_lie_on_the_object_and_noisy_ones_near_it(can_scene: Scene,
     ideal = replace(can_scene).observe(seed=1, ideal=True)
     np.testing.assert_array_equal(ideal.T_world_camera, can_view.T_world_camera)
     assert distance(ideal.points_world).max() < 1e-4
-    noisy = distance(can_view.points_world)
+    # as much as the camera is off, the points are
+    noisy = distance(can_view.points_world - np.median(can_view.points_world, 0) + np.median(ideal.points_world, 0))
     assert np.quantile(noisy, 0.99) < 6e-3
     assert noisy.mean() > 1e-4, "the sensor has noise"
 
 
 def test_a_given_camera_and_pose_are_honoured(can_scene: Scene) -> None:
     scene = replace(can_scene, T_world_camera=None)
-    pose = plots.look_at(np.array([0.0, 0, 0.05]), 0.5, 1.0, 0.8)
+    pose = look_at(np.array([0.0, 0, 0.05]), 0.5, 1.0, 0.8)
     observation = scene.observe(camera=SMALL, T_world_camera=pose, ideal=True)
     assert observation.camera == SMALL
     np.testing.assert_array_equal(observation.T_world_camera, pose)
@@ -288,5 +288,5 @@ def test_a_given_camera_and_pose_are_honoured(can_scene: Scene) -> None:
 def test_an_object_out_of_sight_is_reported(can_scene: Scene, target: tuple[float, ...], distance: float) -> None:
     scene = replace(can_scene, T_world_camera=None)
     with pytest.raises(ValueError, match=r"object can_05 covers \d+ pixels, fewer than 250"):
-        scene.observe(camera=SMALL, T_world_camera=plots.look_at(np.array(target), distance, 0.0, 0.8))
+        scene.observe(camera=SMALL, T_world_camera=look_at(np.array(target), distance, 0.0, 0.8))
     assert scene.T_world_camera is None, "a view that failed leaves no camera"

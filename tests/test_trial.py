@@ -12,7 +12,7 @@ from dexzoo.camera import Observation
 from dexzoo.grasp import Grasps
 from dexzoo.hand import Hand
 from dexzoo.sim import Outcomes, Scene, trial
-from dexzoo.sim.scene import REFERENCE, WORKING
+from dexzoo.sim.world import REFERENCE, WORKING
 from dexzoo.verification import verify
 
 

@@ -6,8 +6,8 @@ manifest.json: version, configuration, counts, and the checksum of each file.
 
 objects  object (its name), category, split (train, validation or test: by object), mass_min, mass_max (kg).
 scenes   one row for each scene that was tried: scene (number), object, category, split, scale, mass (kg), friction,
-         T_world_object (16 numbers, row by row), support_half (3, metres) and T_world_support (16) of the box that the
-         object leans on, if any, seed (of the set), trials (behind success_rate), generated and held (how many grasps
+         T_world_object (16 numbers, row by row), support_half (3, metres) and support_yaw (rad) of the block that the
+         object lies on, if any, seed (of the set), trials (behind success_rate), generated and held (how many grasps
          were generated, and how many of them held), skipped (why the scene has no views and grasps, or null).
 views    scene, view (0 is what the generator saw), seed (of the drawn camera and the sensor's noise), T_world_camera
          (16) of the aimed camera, width, height, fx, fy, cx, cy (pixels), table (4: plane in the camera frame), depth
@@ -42,9 +42,7 @@ DEPTH_UNIT = 1e-4
 SPLITS = ("train", "validation", "test")
 SOURCES = ["generated", "perturbed", "refined"]
 PATH_SIZE = 66
-AIMED_CAMERA = Camera(
-    IMAGE_SIZE, IMAGE_SIZE, 574 * IMAGE_SIZE / 460, 574 * IMAGE_SIZE / 460, (IMAGE_SIZE - 1) / 2, (IMAGE_SIZE - 1) / 2
-)
+_AIMED = Camera.aimed()
 
 _POSE = pa.list_(pa.float64(), 16)
 _FIELDS: dict[str, list[tuple[str, pa.DataType]]] = {
@@ -65,7 +63,7 @@ _FIELDS: dict[str, list[tuple[str, pa.DataType]]] = {
         ("friction", pa.float64()),
         ("T_world_object", _POSE),
         ("support_half", pa.list_(pa.float64(), 3)),
-        ("T_world_support", _POSE),
+        ("support_yaw", pa.float64()),
         ("seed", pa.int64()),
         ("trials", pa.int16()),
         ("generated", pa.int16()),
@@ -131,7 +129,7 @@ def encode_view(observation: Observation, seed: int | None = None, depth: bool =
     Raises ValueError for an observation that is not aimed.
     """
     camera = observation.camera
-    if camera != AIMED_CAMERA:
+    if camera != _AIMED:
         raise ValueError("a grasp set keeps aimed views only; give observation.aimed()")
     return {
         "seed": seed,
@@ -151,11 +149,15 @@ def decode_view(row: dict[str, Any], png: bytes) -> Observation:
     """The aimed observation of a row of views and its depth."""
     where = f"scene {row['scene']}, view {row['view']}"
     camera = Camera.from_dict(row, where)
-    if camera != AIMED_CAMERA:
-        raise ValueError(f"{where} has the camera {camera}; a grasp set keeps aimed views, with {AIMED_CAMERA}")
+    if camera != _AIMED:
+        raise ValueError(f"{where} has the camera {camera}; a grasp set keeps aimed views, with {_AIMED}")
     depth = decode_depth(png, where).astype(np.float32) * np.float32(DEPTH_UNIT)
     pose = np.array(row["T_world_camera"], np.float64).reshape(4, 4)
+<<<<<<< HEAD
     return Observation(depth, camera, pose, np.array(row["table"]), mask=depth > 0)
+=======
+    return Observation(depth, Camera.aimed(), pose, mask=depth > 0)
+>>>>>>> scenes
 
 
 def encode_path(grasps: Grasps, hand: Hand) -> NDArray[np.float32]:

@@ -16,10 +16,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dexzoo import rotation
-from dexzoo.camera import MIN_POINTS, Observation
+from dexzoo.camera import Observation
 from dexzoo.generators.generator import GraspGenerator
 from dexzoo.grasp import GRASP_TYPES, Grasps, pose_matrix
 from dexzoo.hand import Hand, default_hand
+from dexzoo.segmentation import MIN_POINTS
 
 MAX_WIDTH = 0.085
 """Widest thing in metres that fits between open thumb and fingers."""

@@ -16,7 +16,8 @@ from dexzoo import rotation
 from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE, Grasps, pose_matrix
 from dexzoo.hand import Hand
 from dexzoo.sim.robot import to_quaternion
-from dexzoo.sim.scene import REFERENCE, WORKING, Physics, Scene
+from dexzoo.sim.scene import Scene
+from dexzoo.sim.world import REFERENCE, WORKING, Physics
 
 APPROACH_DISTANCE = 0.05
 APPROACH, CLOSE, SQUEEZE_TIME, PAUSE, LIFT, HOLD = 0.2, 0.9, 0.4, 0.1, 2.0, 2.0

@@ -1,0 +1,102 @@
+"""How an object comes to lie in a scene: its orientation, what it lies on, and its drop."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dexzoo.sim.objects import ObjectModel
+from dexzoo.sim.world import WORKING, Support, make_world
+
+TRIES = 3
+MAX_SIZE = 0.5
+"""Largest extent in metres of an object that a scene holds: what a camera 0.4 m away still sees most of."""
+SUPPORT_HEIGHT = 0.04
+FINGER_CLEARANCE = 0.022
+"""What a supported object keeps from the table, in metres: a finger's thickness."""
+LONG = ("fork", "knife", "scissors", "spatula", "spoon")
+"""Categories of long flat things; they lie on a block of 40 % of their length and 70 % of their width."""
+WIDE = ("dustpan", "pan", "plate")
+"""Categories whose rim would lie too low for fingers; they lie on a square block of half their smaller extent."""
+DROP = 0.005
+SETTLE_TIME = 4.0
+_STILL = 0.01  # m/s and rad/s, for 25 steps together
+_STAYS = 5e-4  # m, or half radians, over the last quarter of the time
+
+
+def place(obj: ObjectModel, seed: int) -> tuple[NDArray[np.float64], Support | None]:
+    """Drop an object and let it settle: its pose T_world_object (4, 4), and the block it lies on, if any.
+
+    The yaw is random. Funnels, and cups in half of the scenes, start in any orientation (the simulator behind the
+    thesis). Its lowest point starts 5 mm above the table or the block, its centre of mass over the origin.
+    Raises ValueError when it is too large, or does not come to rest near the origin in three tries.
+    """
+    if obj.mesh.extents.max() > MAX_SIZE:
+        raise ValueError(
+            f"object {obj.name} is {obj.mesh.extents.max():.2f} m large, too large to place; a scene holds "
+            f"{MAX_SIZE:g} m, so scale it down"
+        )
+    rng = np.random.default_rng(seed)
+    tumbled = obj.category == "funnel" or (obj.category == "cup" and rng.random() < 0.5)
+    support = support_for(obj)
+    for _ in range(TRIES):
+        yaw = rng.uniform(0, 2 * np.pi)
+        quaternion = rng.normal(size=4) if tumbled else np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+        if support is not None:
+            support = replace(support, yaw=yaw)
+        pose = _settle(obj, support, quaternion / np.linalg.norm(quaternion))
+        if pose is not None:
+            return pose, support
+    place = "the table" if support is None else "its support"
+    raise ValueError(
+        f"object {obj.name} does not come to rest on {place} in {TRIES} tries; check its mesh, convex parts and size"
+    )
+
+
+def support_for(obj: ObjectModel) -> Support | None:
+    """The block that objects of this category lie on, narrower than they are, so that fingers get under them."""
+    x, y = (float(extent) for extent in obj.mesh.extents[:2])
+    if obj.category in LONG:
+        along, across = (0.2, 0.35) if x > y else (0.35, 0.2)
+        return Support((along * x, across * y, SUPPORT_HEIGHT / 2), 0.0)
+    if obj.category in WIDE:
+        return Support((min(x, y) / 4, min(x, y) / 4, SUPPORT_HEIGHT / 2), 0.0)
+    return None
+
+
+def _settle(obj: ObjectModel, support: Support | None, quaternion: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The pose in which a dropped object lies still, or None if it does not, or not where it should."""
+    model = make_world(obj, WORKING, support).compile()
+    data = mujoco.MjData(model)
+    flat = np.zeros(9)
+    mujoco.mju_quat2Mat(flat, quaternion)
+    turn = flat.reshape(3, 3)
+    top = 0.0 if support is None else SUPPORT_HEIGHT
+    data.qpos[:2] = -(turn @ obj.inertia[0])[:2]
+    data.qpos[2] = top + DROP - _lowest(obj, turn)
+    data.qpos[3:] = quaternion
+    still = 0
+    late = data.qpos.copy()
+    for step in range(int(SETTLE_TIME / WORKING.timestep)):
+        mujoco.mj_step(model, data)
+        data.qvel[:] *= 0.98  # air, without which a ball would roll for ever
+        still = still + 1 if np.abs(data.qvel).max() < _STILL else 0
+        if still >= 25:
+            break
+        if step == int(0.75 * SETTLE_TIME / WORKING.timestep):
+            late = data.qpos.copy()
+    # what rocks on three points trembles for ever, but stays where it is
+    stays = still >= 25 or np.abs(data.qpos - late).max() < _STAYS
+    body = data.body("object")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = body.xmat.reshape(3, 3), body.xpos
+    supported = support is None or pose[2, 3] + _lowest(obj, pose[:3, :3]) > FINGER_CLEARANCE
+    return pose if stays and supported and np.linalg.norm(body.xipos[:2]) < 0.1 else None
+
+
+def _lowest(obj: ObjectModel, turn: NDArray[np.float64]) -> float:
+    """Height in m of the turned object's lowest point over its own origin."""
+    return float((obj.mesh.vertices @ turn[2]).min())

@@ -1,0 +1,108 @@
+"""The physics of a scene: how it is simulated, and the table and the object as MuJoCo sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from dexzoo.sim.objects import Mesh, ObjectModel
+from dexzoo.sim.robot import HAND, OBJECT, TABLE, to_quaternion
+
+
+@dataclass(frozen=True)
+class Physics:
+    """How finely a trial is simulated. timestep in seconds; stops_early: a trial ends once its object is lost."""
+
+    timestep: float = 0.004
+    noslip_iterations: int = 0
+    stops_early: bool = True
+
+
+WORKING = Physics()
+"""What all labels are made with."""
+REFERENCE = Physics(timestep=0.001, noslip_iterations=5, stops_early=False)
+"""What the labels are compared with."""
+
+
+@dataclass(frozen=True)
+class Support:
+    """A block fixed to the table in its middle, which an object lies on so that fingers get under it.
+
+    half: its half sizes in m; yaw in radians about the vertical. It stands on z = 0 over the world's origin.
+    """
+
+    half: tuple[float, float, float]
+    yaw: float
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """T_world_support (4, 4), of the block's centre."""
+        pose = np.eye(4)
+        pose[:2, :2] = [[np.cos(self.yaw), -np.sin(self.yaw)], [np.sin(self.yaw), np.cos(self.yaw)]]
+        pose[2, 3] = self.half[2]
+        return pose
+
+    @property
+    def mesh(self) -> Mesh:
+        """Its surface in the world frame."""
+        box: Mesh = trimesh.creation.box(2 * np.array(self.half), self.pose)
+        return box
+
+
+def make_world(obj: ObjectModel, physics: Physics, support: Support | None = None) -> mujoco.MjSpec:
+    """Table, support and object. The object's friction acts on all its contacts, since its geoms have priority."""
+    world = mujoco.MjSpec()
+    world.compiler.degree = False
+    option = world.option
+    option.timestep = physics.timestep
+    option.noslip_iterations = physics.noslip_iterations
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 10
+    world.worldbody.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[2, 2, 0.1],
+        contype=TABLE,
+        conaffinity=HAND | OBJECT,
+        friction=[0.5, 0.005, 0.0001],
+    )
+    if support is not None:
+        world.worldbody.add_geom(
+            name="support",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=support.half,
+            pos=support.pose[:3, 3],
+            quat=to_quaternion(support.pose[:3, :3]),
+            contype=TABLE,
+            conaffinity=HAND | OBJECT,
+            condim=4,
+            friction=[0.5, 0.005, 0.0001],
+        )
+    center, inertia = obj.inertia
+    body = world.worldbody.add_body(name="object", mass=obj.mass, ipos=center, explicitinertial=True)
+    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    body.add_freejoint(name="object")
+    for index, hull in enumerate(obj.hulls):
+        world.add_mesh(
+            name=f"hull_{index}",
+            uservert=hull.vertices.astype(np.float32).ravel(),
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
+        )
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=f"hull_{index}",
+            contype=OBJECT,
+            conaffinity=HAND | TABLE,
+            priority=1,
+            condim=4,
+            friction=[obj.friction, 0.005 * obj.friction, 0.0001 * obj.friction],
+            solref=[0.01, 1],
+            solimp=[0.95, 0.99, 0.001, 0.5, 2],
+            mass=0,
+        )
+    return world
