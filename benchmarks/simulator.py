@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dexzoo.data.schema import GraspSet
+from dexzoo.data.grasp_set import GraspSet
 from dexzoo.grasp import Grasps
 from dexzoo.hand import default_hand
 from dexzoo.sim import Scene, trial

@@ -15,8 +15,8 @@ views    scene, view (0 is what the generator saw), seed (of the drawn camera an
 grasps   scene, view (the one it is paired with, drawn among the scene's), grasp_type (0 to 9), source (generated,
          perturbed or refined), rank (place in the generator's order from 0; a neighbour has that of the grasp it was
          made from), log_likelihood (null where not generated), path (3 x 22: wrist position, quaternion wxyz and free
-         joints at pre-grasp, grip and squeeze, world frame), and what the trial found, as in `dexzoo.sim.Outcomes`;
-         success_rate is null where the grasp was tried once.
+         joints at pre-grasp, grip and squeeze, world frame), and what the trial found, as in `dexzoo.sim.Outcomes`
+         with null for NaN; success_rate is null where the grasp was tried once.
 
 Frames, joint order and units: docstring of `dexzoo.grasp`.
 """
@@ -29,7 +29,6 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -153,11 +152,7 @@ def decode_view(row: dict[str, Any], png: bytes) -> Observation:
         raise ValueError(f"{where} has the camera {camera}; a grasp set keeps aimed views, with {_AIMED}")
     depth = decode_depth(png, where).astype(np.float32) * np.float32(DEPTH_UNIT)
     pose = np.array(row["T_world_camera"], np.float64).reshape(4, 4)
-<<<<<<< HEAD
     return Observation(depth, camera, pose, np.array(row["table"]), mask=depth > 0)
-=======
-    return Observation(depth, Camera.aimed(), pose, mask=depth > 0)
->>>>>>> scenes
 
 
 def encode_path(grasps: Grasps, hand: Hand) -> NDArray[np.float32]:
@@ -166,7 +161,7 @@ def encode_path(grasps: Grasps, hand: Hand) -> NDArray[np.float32]:
     return torch.cat((key[..., :7], hand.reduce(key[..., 7:27])), -1).flatten(1).numpy().astype(np.float32)
 
 
-def decode_path(path: Float[Tensor, "grasp 66"], grasp_type: Tensor, hand: Hand) -> Grasps:
-    """The grasps, in the world frame, of a column path."""
-    key = path.unflatten(-1, (3, 22))
+def decode_path(path: NDArray[np.float32], grasp_type: Tensor, hand: Hand) -> Grasps:
+    """The grasps, in the world frame, of a column path (num_grasps, 66)."""
+    key = torch.tensor(path).unflatten(-1, (3, 22))
     return Grasps.from_keyframes(key[..., :3], key[..., 3:7], hand.expand(key[..., 7:]), grasp_type, "world")
