@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import dexzoo
-from dexzoo.data.collect import split_of
-from dexzoo.sim.shapes import make_object, object_names
+from dexzoo.sim.shapes import make_object, object_names, split_of
 
 GROUPS = {
     "A: 2 steps, all waypoints": ("waypoints", 2),

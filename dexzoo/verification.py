@@ -11,18 +11,22 @@ from dexzoo import rotation
 from dexzoo.grasp import POSITION, QUATERNION, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.sim import Outcomes, Scene, trial
+from dexzoo.sim.execution import Variation
 
 WRIST_ERROR, TURN_ERROR = 0.001, 0.01
 """Standard deviations of the drawn wrist error: metres along and radians about each axis."""
+MASS_FACTOR, FRICTION = (0.8, 1.2), (0.5, 1.0)
+"""Bounds of the drawn mass, over that of the object, and of the drawn friction (thesis, section 3.5.1)."""
 
 
-def verify(grasps: Grasps, scene: Scene, seed: int = 0, trials: int = 1) -> Outcomes:
+def verify(grasps: Grasps, scene: Scene, seed: int = 0, trials: int = 1, num_threads: int = 0) -> Outcomes:
     """Execute each grasp on the scene in MuJoCo: close, lift 1 m, hold 2 s.
 
     grasps: in the world frame, or in the camera frame of the scene's latest observation.
     trials: 1 executes each grasp as it is. More repeat it under a mass within 20 %, a friction from U[0.5, 1] and a
-    wrist error, drawn anew by `seed` for each trial: `success_rate` is then the share that holds, and the other fields
-    are those of the first trial.
+    wrist error, drawn anew by `seed` for each grasp and trial: `success_rate` is then the share that holds, and the
+    other fields are those of the first trial.
+    num_threads: 0 uses all cores; the outcomes do not depend on it.
     Raises ValueError for joints outside their limits, or grasps in the camera frame of a scene not yet observed.
     """
     if trials < 1:
@@ -36,16 +40,16 @@ def verify(grasps: Grasps, scene: Scene, seed: int = 0, trials: int = 1) -> Outc
             )
         grasps = grasps.to_frame("world", scene.T_world_camera)
     if trials == 1:
-        return trial.run(scene, grasps, hand)
+        return trial.run(scene, grasps, hand, num_threads)
     rng = np.random.default_rng(seed)
-    runs = []
-    for _ in range(trials):
-        obj = replace(
-            scene.object, mass=scene.object.mass * float(rng.uniform(0.8, 1.2)), friction=float(rng.uniform(0.5, 1.0))
-        )
-        runs.append(trial.run(replace(scene, object=obj), _displaced(grasps, rng), hand))
-    rate = np.stack([run.success for run in runs]).mean(0, dtype=np.float32)
-    return replace(runs[0], success_rate=rate)
+    count = len(grasps)
+    repeated = _displaced(grasps[np.tile(np.arange(count), trials)], rng)
+    drawn = Variation(
+        scene.object.mass * rng.uniform(*MASS_FACTOR, len(repeated)), rng.uniform(*FRICTION, len(repeated))
+    )
+    outcomes = trial.run(scene, repeated, hand, num_threads, variation=drawn)
+    rate = outcomes.success.reshape(trials, count).mean(0, dtype=np.float32)
+    return replace(outcomes[:count], success_rate=rate)
 
 
 def _displaced(grasps: Grasps, rng: np.random.Generator) -> Grasps:

@@ -43,7 +43,7 @@ def hand() -> Hand:
 
 @pytest.fixture(scope="session")
 def can_scene() -> Scene:
-    return Scene.place(make_object("can_05"), seed=0)
+    return Scene.place(make_object("can_01"), seed=0)
 
 
 @pytest.fixture(scope="session")

@@ -241,7 +241,7 @@ def refused(result: tuple[int, str, str], message: str) -> None:
         ),
         (["verify"], "required: --object"),
         (["verify", "--object", "can_02", "--trials", "two"], "--trials: Not of type PositiveInt"),
-        (["verify", "--object", "can_99"], "object 'can_99' is unknown; known are ball_00...03"),
+        (["verify", "--object", "can_99"], "object 'can_99' is unknown; known are bottle_00...24"),
         (["verify", "--object", "none.obj"], "mesh none.obj does not exist"),
         (["verify", "--object", "can_02", "--mass", "-1"], "object can_02 has a mass of -1.0 kg; give a positive one"),
         (["verify", "--object", "can_02", "--friction", "3"], "has a friction of 3.0; give one in (0, 2]"),

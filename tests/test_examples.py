@@ -26,7 +26,7 @@ ELSEWHERE = ("collect", "fit", "test", "view")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the files that README's lines name."""
     folder = tmp_path_factory.mktemp("desk")
-    obj = make_object("can_05")
+    obj = make_object("can_01")
     obj.mesh.export(folder / "mug.obj")
     observation = Scene.place(obj, seed=0).observe(seed=0)
     cv2.imwrite(str(folder / "depth.png"), np.round(observation.depth * 10_000).astype(np.uint16))

@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from dexzoo.sim import ObjectModel
-from dexzoo.sim.shapes import MASS_RANGE, NUM_OBJECTS, make_object, object_names
 
 box = trimesh.creation.box
 
@@ -162,8 +161,6 @@ def not_finite() -> trimesh.Trimesh:
         (lambda: ObjectModel.from_mesh(CUBE, hulls=[trimesh.Trimesh()]), "mesh hull of object is empty"),
         (lambda: ObjectModel.from_mesh(CUBE, hulls=[SLIVER]), "has no convex parts; give hulls=None to have them"),
         (lambda: ObjectModel.from_mesh(CUBE, hulls=[box([100, 100, 100])]), "mesh hull of object is 100.0 m large"),
-        (lambda: make_object("mug_99"), r"object 'mug_99' is unknown; known are ball_00\.\.\.03, .*mug_00\.\.\.07"),
-        (lambda: make_object("teapot"), "object 'teapot' is unknown"),
     ],
 )
 def test_bad_objects_are_refused_in_one_line(make: Callable[[], ObjectModel], message: str) -> None:
@@ -198,43 +195,3 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         ObjectModel.from_mesh(tmp_path / "none.obj")
     with pytest.raises(FileNotFoundError, match=r"mesh .*none\.obj does not exist"):
         ObjectModel.from_mesh(CUBE, hulls=[tmp_path / "none.obj"])
-
-
-# the parametric objects
-
-
-@pytest.mark.parametrize("category", NUM_OBJECTS)
-def test_every_parametric_object_is_sound(category: str) -> None:
-    for name in (name for name in object_names() if name.startswith(category)):
-        model = make_object(name)
-        assert (model.name, model.category) == (name, category)
-        assert all(hull.is_convex and hull.is_watertight and hull.volume > 0 for hull in model.hulls), name
-        low = np.min([hull.bounds[0] for hull in model.hulls], axis=0)
-        high = np.max([hull.bounds[1] for hull in model.hulls], axis=0)
-        np.testing.assert_allclose(model.mesh.bounds, [low, high], atol=1e-9, err_msg=name)
-        assert model.mesh.bounds[0][2] == pytest.approx(0, abs=1e-12), f"{name} stands on the table"
-        assert MASS_RANGE[category][0] <= model.mass <= MASS_RANGE[category][1]
-        assert 0.5 <= model.friction <= 1.0
-        assert np.linalg.eigvalsh(model.inertia[1]).min() > 0
-        assert model.inertia[0][2] > 0
-
-
-def test_names_are_unique_and_objects_differ() -> None:
-    names = object_names()
-    assert len(set(names)) == len(names) == sum(NUM_OBJECTS.values()) >= 40
-    extents = np.array([make_object(name).mesh.extents for name in names])
-    assert len(np.unique(extents.round(6), axis=0)) == len(names)
-
-
-def test_an_object_is_always_the_same() -> None:
-    first, second = make_object("mug_03"), make_object("mug_03")
-    assert first.mesh.vertices.tobytes() == second.mesh.vertices.tobytes()
-    assert (first.mass, first.friction) == (second.mass, second.friction)
-
-
-@pytest.mark.parametrize("name", ["mug_00", "bowl_00"])
-def test_vessels_are_hollow(name: str) -> None:
-    model = make_object(name)
-    middle = [0.0, 0.0, float(model.mesh.bounds[1][2]) - 0.02]
-    assert not covers(model, [middle]).any()
-    assert covers(model, [[0.0, 0.0, 0.001]]).all()

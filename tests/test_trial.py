@@ -12,7 +12,8 @@ from dexzoo.camera import Observation
 from dexzoo.grasp import Grasps
 from dexzoo.hand import Hand
 from dexzoo.sim import Outcomes, Scene, trial
-from dexzoo.sim.world import REFERENCE, WORKING
+from dexzoo.sim.motion import END, Motion
+from dexzoo.sim.world import REFERENCE, WORKING, Support
 from dexzoo.verification import verify
 
 
@@ -79,7 +80,8 @@ def test_a_replay_ends_as_the_trial_did(
             np.linalg.inv(trial.pose_matrix(m.waypoint[:3], m.waypoint[3:7]).numpy()) @ m.T_world_object
             for m in trial.replay(can_scene, grasp, hand, [0.0, trial.LIFT + trial.HOLD])
         )
-        return float(np.linalg.norm(gripped[:3, 3] - held[:3, 3]))
+        center = np.append(can_scene.object.inertia[0], 1)
+        return float(np.linalg.norm((gripped - held) @ center))
 
     held = np.flatnonzero(can_outcomes.success)[:2]
     for index in held:
@@ -107,35 +109,63 @@ def test_a_path_into_the_table_is_not_executed(can_scene: Scene, good: Grasps, h
     assert np.isnan(outcomes.shift).all()
 
 
-def test_a_collision_between_waypoints_is_seen(good: Grasps, hand: Hand) -> None:
+def collided(scene: Scene, waypoints: torch.Tensor, hand: Hand) -> bool:
+    return bool(trial.run(scene, Grasps(waypoints, "world"), hand).collided.all())
+
+
+def test_a_collision_between_waypoints_is_seen(can_scene: Scene, good: Grasps, hand: Hand) -> None:
     """The path is looked at in between, and the approach before the pre-grasp as well."""
-    grasp = good[:1]
-    assert not trial.touches_table(grasp, hand).any()
-    waypoints = grasp.waypoints.clone()
+    waypoints = good[:1].waypoints.clone()
+    assert not collided(can_scene, waypoints, hand)
     waypoints[:, 3, 2] -= 0.3
-    assert trial.touches_table(Grasps(waypoints, "world"), hand).all()
+    assert collided(can_scene, waypoints, hand)
 
 
-def test_the_squeeze_may_press_on_the_table_but_the_grip_may_not(good: Grasps, hand: Hand) -> None:
+def test_the_squeeze_may_press_on_the_table_but_the_grip_may_not(can_scene: Scene, good: Grasps, hand: Hand) -> None:
     waypoints = good[:1].waypoints.clone()
     waypoints[:, 8:, 2] -= 0.3
-    assert not trial.touches_table(Grasps(waypoints, "world"), hand).any()
+    assert not collided(can_scene, waypoints, hand)
     waypoints[:, 6, 2] -= 0.3
-    assert trial.touches_table(Grasps(waypoints, "world"), hand).all()
+    assert collided(can_scene, waypoints, hand)
+
+
+def test_a_block_on_the_table_stands_in_the_way_as_well(can_scene: Scene, good: Grasps, hand: Hand) -> None:
+    block = replace(can_scene, support=Support((0.5, 0.5, float(good.position[:, :7, 2].amin())), 0.0))
+    assert trial.run(block, good, hand).collided.all()
+
+
+def test_a_grasp_that_starts_in_the_object_is_no_plain_failure(can_scene: Scene, good: Grasps, hand: Hand) -> None:
+    center = can_scene.object.inertia[0] + can_scene.T_world_object[:3, 3]
+    waypoints = good[:2].waypoints.clone()
+    back = trial.Execution(can_scene, good[:2], hand, can_scene.model(hand.spec), WORKING)
+    palm = torch.tensor(back.wrist(back.everyone)[:, :3]).float()
+    waypoints[:1, :, :3] += (torch.tensor(center).float() - palm[:1])[:, None]
+    waypoints[:1, :, 2] += 0.02  # above the table
+    outcomes = trial.run(can_scene, Grasps(waypoints, "world"), hand)
+    assert outcomes.starts_inside.tolist() == [True, False]
+    assert outcomes.success.tolist() == [False, True]
+    assert np.isnan(outcomes.lost_at[0])
+    assert np.isnan(outcomes.closing_shift[0])
+
+
+def test_the_hand_may_touch_the_object_on_its_way(can_scene: Scene, good: Grasps, hand: Hand) -> None:
+    """That is what a grip is, and pushing it over is a failure that was tried."""
+    outcomes = trial.run(can_scene, moved(good, [0.0, 0.0, 0.01]), hand)
+    assert not outcomes.starts_inside.any()
 
 
 def test_a_fall_at_the_end_is_no_success(
     can_scene: Scene, good: Grasps, hand: Hand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The hand opens a moment before the end: the object is not yet far, but it falls."""
-    commands = trial.trajectory
+    commands = Motion.at
 
-    def opening(grasps: Grasps, hand: Hand, timestep: float) -> tuple[Any, Any, Any]:
-        wrist, turn, angles = commands(grasps, hand, timestep)
-        angles[:, -50:] = 0.0
+    def opening(self: Motion, times: np.ndarray, ids: np.ndarray) -> tuple[Any, Any, Any]:
+        wrist, turn, angles = commands(self, times, ids)
+        angles[:, times > END - 0.2] = 0.0
         return wrist, turn, angles
 
-    monkeypatch.setattr(trial, "trajectory", opening)
+    monkeypatch.setattr(Motion, "at", opening)
     outcomes = trial.run(can_scene, good[:4], hand)
     assert not outcomes.success.any()
     assert (outcomes.lost_at > trial.LIFT + trial.HOLD - 0.5).all()
@@ -155,35 +185,35 @@ def test_a_slippery_object_is_not_held(can_scene: Scene, good: Grasps, hand: Han
 def test_a_diverged_simulation_is_unstable_and_no_success(
     can_scene: Scene, good: Grasps, hand: Hand, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings in the working folder
-    advance = trial._Execution.advance
+    monkeypatch.chdir(tmp_path)
+    advance = trial.Execution.advance
 
-    def shaken(self: trial._Execution, ids: np.ndarray, begin: int, end: int) -> None:
-        if begin == 0:
+    def shaken(self: trial.Execution, ids: np.ndarray, until: float) -> None:
+        if self.time == 0:
             self.qpos[0, self.object_at] = np.nan  # a bad state
             self.qvel[1, self.object_dof] = 1e12  # one that MuJoCo resets with a warning
-        advance(self, ids, begin, end)
+        advance(self, ids, until)
 
-    monkeypatch.setattr(trial._Execution, "advance", shaken)
+    monkeypatch.setattr(trial.Execution, "advance", shaken)
     outcomes = trial.run(can_scene, good[:4], hand)
     assert outcomes.unstable.tolist() == [True, True, False, False]
     assert outcomes.success.tolist() == [False, False, True, True]
     assert np.isnan(outcomes.shift[:2]).all()
+    assert not list(tmp_path.iterdir()), "MuJoCo's log is kept out of the working folder"
 
 
 def test_a_diverged_trial_is_repeated_at_the_reference_setting(
-    can_scene: Scene, good: Grasps, hand: Hand, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    can_scene: Scene, good: Grasps, hand: Hand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    advance = trial._Execution.advance
+    advance = trial.Execution.advance
 
-    def shaken(self: trial._Execution, ids: np.ndarray, begin: int, end: int) -> None:
-        if begin == 0 and self.batch.model.opt.timestep == WORKING.timestep:
+    def shaken(self: trial.Execution, ids: np.ndarray, until: float) -> None:
+        if self.time == 0 and self.physics == WORKING:
             self.qpos[0, self.object_at] = np.nan
-        advance(self, ids, begin, end)
+        advance(self, ids, until)
 
     alone = trial.run(can_scene, good[:1], hand, physics=REFERENCE)
-    monkeypatch.setattr(trial._Execution, "advance", shaken)
+    monkeypatch.setattr(trial.Execution, "advance", shaken)
     outcomes = trial.run(can_scene, good[:2], hand)
     assert not outcomes.unstable.any()
     assert outcomes.success[0] == alone.success[0]

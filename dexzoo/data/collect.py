@@ -24,7 +24,7 @@ from dexzoo.generators.generator import GraspGenerator
 from dexzoo.grasp import Grasps
 from dexzoo.hand import default_hand
 from dexzoo.sim import Outcomes, Scene, trial
-from dexzoo.sim.shapes import MASS_RANGE, make_object, object_names
+from dexzoo.sim.shapes import MASS_RANGE, make_object, object_names, split_of
 from dexzoo.sim.world import WORKING
 
 MIN_GENERATED = 10
@@ -132,7 +132,7 @@ def make_scene(configuration: Configuration, number: int) -> SceneRows:
     if not row["held"]:
         return scene_rows(row | {"skipped": "no generated grasp holds"})
     parents = choose(outcomes.success, round(NEIGHBOUR_RATIO * len(path)), rng)
-    near = perturb(path[parents], hand, rng)
+    near = encode_path(perturb(generated[parents], hand, rng), hand)
     neighbours = decode_path(near, generated.grasp_type[parents], hand)
     outcomes = Outcomes.concatenate([outcomes, trial.run(scene, neighbours, hand, num_threads=1)])
     rank = np.concatenate((np.arange(len(path)), parents))
@@ -171,8 +171,8 @@ def object_of(number: int, split: str) -> str:
 def _mixed(splits: tuple[str, ...]) -> list[str]:
     """The objects of some splits, those of each category spread evenly over the list."""
     by_category: dict[str, list[str]] = {}
-    for name in object_names():
-        if split_of(name) in splits:
+    for split in splits:
+        for name in object_names(split):
             by_category.setdefault(_category(name), []).append(name)
     places = [
         ((place + 0.5) / len(names), category, name)
@@ -182,30 +182,17 @@ def _mixed(splits: tuple[str, ...]) -> list[str]:
     return [name for *_, name in sorted(places)]
 
 
-def split_of(name: str) -> str:
-    """The split of an object: of each category every fourth is test, every eighth validation."""
-    number = int(name.rpartition("_")[2])
-    return "test" if number % 4 == 3 else "validation" if number % 8 == 1 else "train"
-
-
 def _category(name: str) -> str:
     return name.rpartition("_")[0]
 
 
 def _objects(split: str) -> list[dict[str, Any]]:
+    """Rows of the table of objects."""
     rows = []
-    for name in object_names():
-        if split in (ALL, split_of(name)):
-            low, high = MASS_RANGE[_category(name)]
-            rows.append(
-                {
-                    "object": name,
-                    "category": _category(name),
-                    "split": split_of(name),
-                    "mass_min": low,
-                    "mass_max": high,
-                }
-            )
+    for name in object_names(None if split == ALL else split):
+        low, high = MASS_RANGE[_category(name)]
+        row = {"object": name, "category": _category(name), "split": split_of(name)}
+        rows.append({**row, "mass_min": low, "mass_max": high})
     return rows
 
 
@@ -252,7 +239,7 @@ def _likelihood(grasps: Grasps) -> list[float | None]:
 def _success_rate(grasps: Grasps, scene: Scene, trials: int, seed: int) -> list[float] | list[None]:
     if trials == 1:
         return [None] * len(grasps)
-    rate: list[float] = verification.verify(grasps, scene, seed, trials).success_rate.tolist()
+    rate: list[float] = verification.verify(grasps, scene, seed, trials, 1).success_rate.tolist()
     return rate
 
 

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dexzoo import rotation
+from dexzoo.data.schema import decode_path, encode_path
+from dexzoo.grasp import Grasps
 from dexzoo.hand import Hand
 
 WRIST_STEP = (0.002, 0.015)
@@ -33,13 +35,13 @@ def choose(success: NDArray[np.bool_], num: int, rng: np.random.Generator) -> ND
     )
 
 
-def perturb(path: NDArray[np.float32], hand: Hand, rng: np.random.Generator) -> NDArray[np.float32]:
-    """A neighbour of each path, both (num_grasps, 66) as in the column of a grasp set, within the ranges above.
+def perturb(grasps: Grasps, hand: Hand, rng: np.random.Generator) -> Grasps:
+    """A neighbour of each grasp, both in the world frame, within the ranges above.
 
     The whole path moves with the wrist; the joints of grip and squeeze change alike, those of the pre-grasp do not.
     """
-    n = len(path)
-    key = torch.from_numpy(path).unflatten(-1, (3, 22))
+    n = len(grasps)
+    key = torch.from_numpy(encode_path(grasps, hand)).unflatten(-1, (3, 22))
 
     def direction() -> Tensor:
         return torch.nn.functional.normalize(torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32), dim=-1)
@@ -55,4 +57,4 @@ def perturb(path: NDArray[np.float32], hand: Hand, rng: np.random.Generator) -> 
     joints = key[..., 7:].clone()
     joints[:, 1:] += change[:, None]
     near = torch.cat((position, quaternion, hand.clamp(joints)), -1).flatten(1)
-    return np.asarray(near.numpy(), np.float32)
+    return decode_path(near.numpy(), grasps.grasp_type, hand)
