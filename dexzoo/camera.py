@@ -199,6 +199,19 @@ class Observation:
         T = self.T_world_camera
         return (self.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
 
+    def would_see(self, points_world: NDArray[np.floating[Any]], margin: float = 0.005) -> NDArray[np.bool_]:
+        """(num_points,) which points of the world would lie in plain view, by `margin` metres in front of what is seen.
+
+        No part of the scene can be there.
+        """
+        T = np.linalg.inv(self.T_world_camera)
+        points = points_world @ T[:3, :3].T + T[:3, 3]
+        column, row = np.round(self.camera.project(points)).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
+        seen = np.zeros(len(points))
+        seen[inside] = self.depth[row[inside], column[inside]]
+        return np.asarray((seen > 0) & (points[:, 2] < seen - margin))
+
     def aimed(self, size: int = IMAGE_SIZE) -> Observation:
         """The view of a camera in the same place that looks at the object's centre, upright.
 

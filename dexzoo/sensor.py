@@ -1,4 +1,8 @@
-"""The depth sensor: what it reads of a depth image known exactly."""
+"""The depth sensor: what a structured-light camera reads of a scene whose depth is known exactly.
+
+The figures are those of the simulator behind the thesis (a Kinect model after Gschwandtner et al., BlenSor, 2011, and
+Bohg et al. 2014), except where a constant says that it is ours, fitted to real frames by `benchmarks/sensor.py`.
+"""
 
 from __future__ import annotations
 
@@ -7,25 +11,75 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexzoo.camera import Camera
-from dexzoo.segmentation import MAX_DEPTH
 
 BASELINE = 0.075
-"""Metres from the camera to the projector, along the camera's x."""
+"""Metres from the camera to the projector, along the camera's x: shadows fall on the left of things."""
+DISPARITY_NOISE = 0.075
+"""Standard deviation in pixels, drawn on a grid 1.5 times coarser than the image."""
+DISPARITY_STEP = 1 / 8
+"""Pixels."""
+WINDOW = 9
+"""Width in pixels of the window whose dots are matched with the projector's."""
+MAX_DISTURBED = 1 / 3
+"""Share of the window's dots that may be missing or of a nearer surface, before the pixel is lost."""
+DOT_DENSITY = 1 / 9
+"""Dots a pixel; ours. So few dots make edges ragged."""
+SURFACE_STEP = 1.0
+"""Pixels of disparity by which a dot must be nearer to be of another surface; ours."""
+MAX_SLOPE = 0.5
+"""Pixels of disparity from one pixel to the next, beyond which a surface's dots are torn too far apart; ours.
+
+So steep is a surface 0.6 m away that is seen at less than 15 degrees."""
 
 
 def read_depth(
     depth: NDArray[np.float64], lit: NDArray[np.bool_], camera: Camera, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Depth as a structured-light sensor of 75 mm baseline would read it."""
+    """What the sensor reads, (height, width) m, 0 = no reading.
+
+    depth: (height, width) exact depth in m, 0 = nothing there.
+    lit: (height, width) the pixels whose point the projector reaches; all others have no reading.
+    Of the rest those are lost in whose window more than a third of the dots are unlit, or nearer by more than a pixel
+    of disparity: the farther side of depth edges, and rims of shadows. Dots of a farther surface do not disturb (ours:
+    real frames lose hardly any pixel on the nearer side of an edge). Surfaces seen at a grazing angle are lost too.
+    What is left has Gaussian noise and steps in its disparity.
+    """
     height, width = depth.shape
-    coarse = rng.normal(0, 0.075, (int(height / 1.5), int(width / 1.5))).astype(np.float32)
-    noise = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
-    valid = (depth > 0) & lit
-    disparity = camera.fx * BASELINE / np.where(valid, depth, 1.0)
-    disparity = np.round((disparity + noise) * 8) / 8
-    noisy = camera.fx * BASELINE / np.maximum(disparity, 1e-3)
-    metres = np.where(valid, depth, MAX_DEPTH).astype(np.float32)
-    kernel = np.ones((3, 3), np.uint8)
-    edge = cv2.dilate(metres, kernel) - cv2.erode(metres, kernel) > 0.03
-    valid &= ~(edge & (rng.random(depth.shape) < 0.5))
-    return np.where(valid, noisy, 0).astype(np.float32)
+    there = depth > 0
+    disparity = np.zeros(depth.shape, np.float32)
+    disparity[there] = camera.fx * BASELINE / depth[there]
+    coarse = (max(1, round(width / 1.5)), max(1, round(height / 1.5)))
+    noise = rng.standard_normal(coarse[::-1], np.float32) * np.float32(DISPARITY_NOISE)
+    dots = rng.random(depth.shape, np.float32) < DOT_DENSITY
+    noisy = disparity + cv2.resize(noise, (width, height), interpolation=cv2.INTER_NEAREST)
+    noisy = np.maximum(np.round(noisy / DISPARITY_STEP) * DISPARITY_STEP, DISPARITY_STEP)
+    read = there & lit & ~_disturbed(disparity, there & ~lit, dots) & (_slope(disparity) < MAX_SLOPE)
+    return np.where(read, camera.fx * BASELINE / noisy, 0).astype(np.float32)
+
+
+def _slope(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Its change from pixel to pixel, by the flatter side of each, so that an edge is none."""
+    padded = np.pad(disparity, 1, mode="reflect" if min(disparity.shape) > 1 else "edge")
+    x, y = np.abs(np.diff(padded[1:-1], axis=1)), np.abs(np.diff(padded[:, 1:-1], axis=0))
+    return np.hypot(np.minimum(x[:, 1:], x[:, :-1]), np.minimum(y[1:], y[:-1]))
+
+
+def _disturbed(disparity: NDArray[np.float32], unlit: NDArray[np.bool_], dots: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The pixels whose window matches too few dots."""
+    kernel = np.ones((WINDOW, WINDOW), np.uint8)
+    nearest = cv2.dilate(disparity, kernel)
+    doubtful = (nearest - disparity > SURFACE_STEP) | (cv2.dilate(unlit.astype(np.uint8), kernel) > 0)
+    rows, columns = np.nonzero(doubtful & (disparity > 0) & ~unlit)
+    # only those few are counted dot by dot; outside the image there are no dots
+    reach = WINDOW // 2
+    padded, dark, seen = (np.pad(image, reach) for image in (disparity, unlit, dots))
+    width = padded.shape[1]
+    taps = (np.arange(WINDOW)[:, None] * width + np.arange(WINDOW)).ravel()
+    window = (rows * width + columns)[:, None] + taps
+    nearer = padded.ravel()[window] - disparity[rows, columns, None]
+    wrong = (nearer > SURFACE_STEP) | (dark.ravel()[window] & (nearer > -SURFACE_STEP))
+    counted = seen.ravel()[window]
+    share = (wrong & counted).sum(1) / np.maximum(counted.sum(1), 1)
+    disturbed = np.zeros(disparity.shape, bool)
+    disturbed[rows, columns] = share > MAX_DISTURBED
+    return disturbed

@@ -15,10 +15,8 @@ from scipy.spatial import cKDTree
 
 from dexzoo.camera import Camera, Observation, colourise
 from dexzoo.segmentation import fit_table
-from dexzoo.sensor import read_depth
 
 CAMERA = Camera()
-LIT = np.ones((480, 640), bool)
 CENTER, RADIUS = np.array([0.02, -0.01, 0.05]), 0.05  # a ball on the table
 
 
@@ -266,42 +264,6 @@ def test_curvature_is_zero_where_the_window_leaves_the_object() -> None:
     assert not curvature[:, [0, -1]].any()
     assert not curvature[:, :, [0, -1]].any()
     assert curvature[:, 1:3, 1:-1].all()
-
-
-# --- noise -----------------------------------------------------------------------------------------------------------
-
-
-def slope() -> np.ndarray:
-    """A wall that recedes to the right, so that rounding falls evenly."""
-    return np.tile(np.linspace(0.6, 0.8, 640), (480, 1))
-
-
-def test_noise_is_that_of_disparity() -> None:
-    depth = slope()
-    noisy = read_depth(depth, LIT, CAMERA, np.random.default_rng(0))
-    assert noisy.dtype == np.float32
-    disparity = CAMERA.fx * 0.075 / noisy
-    np.testing.assert_allclose(disparity * 8, np.round(disparity * 8), atol=1e-3)  # steps of 1/8 pixel
-    error = disparity - CAMERA.fx * 0.075 / depth
-    assert abs(error.mean()) < 0.002
-    # 0.075 pixel, smoothed by the enlargement (about 2/3 of it is left), and the rounding's 1/8 / sqrt(12)
-    assert error.std() == pytest.approx(np.hypot(0.075 * 2 / 3, 0.125 / np.sqrt(12)), rel=0.1)
-
-
-def test_noise_repeats_with_the_seed() -> None:
-    a, b, c = (read_depth(slope(), LIT, CAMERA, np.random.default_rng(seed)) for seed in (1, 1, 2))
-    assert np.array_equal(a, b)
-    assert not np.array_equal(a, c)
-
-
-def test_holes_at_edges() -> None:
-    depth = slope()
-    depth[:, 320:] += 0.1
-    depth[:10] = 0
-    hole = read_depth(depth, LIT, CAMERA, np.random.default_rng(0)) == 0
-    assert hole[:10].all()
-    assert 0.4 < hole[20:390, 319:321].mean() < 0.6
-    assert not hole[20:390, :310].any()
 
 
 # --- bad input -------------------------------------------------------------------------------------------------------

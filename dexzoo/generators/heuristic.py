@@ -273,14 +273,7 @@ def complete(observation: Observation, rng: np.random.Generator) -> tuple[NDArra
     turned, turned_normals = cloud.copy(), normals.copy()
     turned[:, :2] = 2 * np.array([cx, cy]) - cloud[:, :2]
     turned_normals[:, :2] *= -1
-    # what turns out in plain view of the camera would have been seen, so it is not there
-    pixels = np.round(observation.camera.project(_to_camera(turned, observation))).astype(int)
-    inside = (
-        (pixels >= 0).all(1) & (pixels[:, 0] < observation.camera.width) & (pixels[:, 1] < observation.camera.height)
-    )
-    hidden = np.ones(len(turned), bool)
-    seen = observation.depth[pixels[inside, 1], pixels[inside, 0]]
-    hidden[inside] = (seen == 0) | (_to_camera(turned, observation)[inside, 2] > seen - 0.005)
+    hidden = ~observation.would_see(turned)  # what would be in plain view would have been seen, so it is not there
     return (
         np.concatenate((cloud, turned[hidden])).astype(np.float32),
         np.concatenate((normals, turned_normals[hidden])).astype(np.float32),
@@ -303,11 +296,6 @@ def spread(grasps: Grasps, score: Tensor, num: int) -> Tensor:
                 continue
         chosen.append(index)
     return torch.tensor(chosen)
-
-
-def _to_camera(points: NDArray[np.floating], observation: Observation) -> NDArray[np.float64]:
-    T = np.linalg.inv(observation.T_world_camera)
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
 def _extent(

@@ -18,12 +18,14 @@ SUPPORT_HEIGHT = 0.04
 FINGER_CLEARANCE = 0.022
 """What a supported object keeps from the table, in metres: a finger's thickness."""
 LONG = ("fork", "knife", "scissors", "spatula", "spoon")
-"""Categories of long flat things; they lie on a block of 40 % of their length and 70 % of their width."""
+"""Categories of long flat things; they lie on a block of 70 % of their width and up to 40 % of their length."""
 WIDE = ("dustpan", "pan", "plate")
 """Categories whose rim would lie too low for fingers; they lie on a square block of half their smaller extent."""
 DROP = 0.005
 SETTLE_TIME = 4.0
-_STILL = 0.01  # m/s and rad/s, for 25 steps together
+_STILL, _STILL_TIME = 0.01, 0.1  # m/s and rad/s, and for how many seconds together
+_PUSH = 0.1  # rad/s, so that a ball does not come to rest on an edge of its mesh
+_AIR = 5.0  # 1/s, by which velocities decay: without it a ball would roll for ever
 _STAYS = 5e-4  # m, or half radians, over the last quarter of the time
 
 
@@ -58,12 +60,17 @@ def place(obj: ObjectModel, seed: int) -> tuple[NDArray[np.float64], Support | N
 
 def support_for(obj: ObjectModel) -> Support | None:
     """The block that objects of this category lie on, narrower than they are, so that fingers get under them."""
-    x, y = (float(extent) for extent in obj.mesh.extents[:2])
+    extents = obj.mesh.extents[:2]
     if obj.category in LONG:
-        along, across = (0.2, 0.35) if x > y else (0.35, 0.2)
-        return Support((along * x, across * y, SUPPORT_HEIGHT / 2), 0.0)
+        axis = int(extents.argmax())
+        # the block stands below the centre of mass, from where one end may be near
+        reach = np.abs(obj.mesh.bounds[:, axis] - obj.inertia[0][axis]).min()
+        half = 0.35 * extents
+        half[axis] = max(min(0.2 * extents[axis], reach - FINGER_CLEARANCE), 0.01)
+        return Support((float(half[0]), float(half[1]), SUPPORT_HEIGHT / 2), 0.0)
     if obj.category in WIDE:
-        return Support((min(x, y) / 4, min(x, y) / 4, SUPPORT_HEIGHT / 2), 0.0)
+        side = float(extents.min()) / 4
+        return Support((side, side, SUPPORT_HEIGHT / 2), 0.0)
     return None
 
 
@@ -78,18 +85,18 @@ def _settle(obj: ObjectModel, support: Support | None, quaternion: NDArray[np.fl
     data.qpos[:2] = -(turn @ obj.inertia[0])[:2]
     data.qpos[2] = top + DROP - _lowest(obj, turn)
     data.qpos[3:] = quaternion
-    still = 0
+    data.qvel[3:5] = _PUSH
+    still_since = 0.0
     late = data.qpos.copy()
-    for step in range(int(SETTLE_TIME / WORKING.timestep)):
+    while data.time < SETTLE_TIME and data.time - still_since < _STILL_TIME:
         mujoco.mj_step(model, data)
-        data.qvel[:] *= 0.98  # air, without which a ball would roll for ever
-        still = still + 1 if np.abs(data.qvel).max() < _STILL else 0
-        if still >= 25:
-            break
-        if step == int(0.75 * SETTLE_TIME / WORKING.timestep):
+        data.qvel[:] *= 1 - _AIR * WORKING.timestep
+        if np.abs(data.qvel).max() > _STILL:
+            still_since = data.time
+        if data.time < 0.75 * SETTLE_TIME:
             late = data.qpos.copy()
     # what rocks on three points trembles for ever, but stays where it is
-    stays = still >= 25 or np.abs(data.qpos - late).max() < _STAYS
+    stays = data.time < SETTLE_TIME or np.abs(data.qpos - late).max() < _STAYS
     body = data.body("object")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = body.xmat.reshape(3, 3), body.xpos

@@ -1,0 +1,193 @@
+"""Kopicki's one-shot generator: grasps of an unknown object from a few demonstrations (Kopicki et al. 2016; thesis, 3.1).
+
+Grips are sampled from the product of experts of `density`, improved on it, and ranked by it less the cost of collisions
+on the way. Each carries its demonstration's approach and squeeze.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dexzoo import rotation
+from dexzoo.camera import Observation
+from dexzoo.generators.demonstration import Demonstration, load_demonstrations
+from dexzoo.generators.density import Bandwidths, GraspDensity, Grips, contact_models
+from dexzoo.generators.features import Features
+from dexzoo.generators.generator import GraspGenerator
+from dexzoo.generators.search import anneal, climb
+from dexzoo.grasp import GRIP, NUM_TYPES, PREGRASP, SQUEEZE, Grasps, pose_matrix
+from dexzoo.hand import Hand, default_hand
+
+NUM_FEATURES = 1000
+MIN_CLEARANCE = 0.002
+"""Metres that every link keeps from the table up to the grip."""
+MAX_REACH = 0.24
+"""Metres that the wrist may be from the nearest observed point at the pre-grasp; the stand-off is shortened for it."""
+COLLISION_STEPS, COLLISION_WEIGHTS = (0.0, 0.4, 0.7, 0.9), (1.0, 1.0, 0.5, 0.2)
+"""Where on the way from the pre-grasp (0) to the grip (1) collisions are looked at, and how much they count."""
+NUM_OBSTACLES = 300
+TABLE_COST = 1000.0
+"""Log-likelihood that a metre below the least clearance costs."""
+
+
+class KopickiGenerator(GraspGenerator):
+    """Grasps like those of the demonstrations.
+
+    demonstrations: what to learn from; the ten of the DLR/HIT hand II by default. num_per_type: most grasps of one type.
+    num_samples: grips drawn for each demonstration; num_kernels: of each link's query density. search: how samples are
+    improved, by simulated annealing as the original or by gradient.
+    """
+
+    def __init__(
+        self,
+        demonstrations: Sequence[Demonstration] | None = None,
+        num_per_type: int = 10,
+        num_samples: int = 1000,
+        num_kernels: int = 5000,
+        widths: Bandwidths | None = None,
+        search: Literal["gradient", "annealing"] = "gradient",
+        num_steps: tuple[int, int] = (20, 40),
+        completes: bool = True,
+    ) -> None:
+        self.hand: Hand = default_hand()
+        self.demonstrations = list(demonstrations or load_demonstrations())
+        self.num_per_type, self.num_samples, self.num_kernels = num_per_type, num_samples, num_kernels
+        self.widths, self.search, self.num_steps = widths or Bandwidths(), search, num_steps
+        self.completes = completes
+        self.models = [contact_models(d, self.hand, self.widths) for d in self.demonstrations]
+
+    def density(self, observation: Observation, seed: int = 0) -> GraspDensity:
+        """The likelihood of grasps of the object seen, in the world frame."""
+        surface = Features.of_view(observation, NUM_FEATURES, np.random.default_rng(seed))
+        if self.completes:
+            surface = surface.completed(observation)
+        generator = torch.Generator().manual_seed(seed)
+        return GraspDensity(self.demonstrations, self.models, surface, self.hand, self.num_kernels, self.widths, generator=generator)
+
+    def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
+        """At most `num_grasps` grasps in the camera frame, the likeliest first, at most `num_per_type` of each type.
+
+        Raises ValueError when too little of the object is seen, RuntimeError when no candidate is feasible.
+        """
+        if num_grasps < 1:
+            raise ValueError(f"num_grasps is {num_grasps}, expected at least 1")
+        generator = torch.Generator().manual_seed(seed)
+        density = self.density(observation, seed)
+        way = Way(self.demonstrations, self.hand, density.surface.points, generator)
+        with torch.no_grad():
+            grips = density.sample(self.num_samples, generator)
+            grips = best(grips, density.screen(grips) - way.table_cost(grips), self.num_samples // 20)
+        for num_steps, keep in zip(self.num_steps, (3 * self.num_per_type, None), strict=True):
+            if self.search == "gradient":
+                grips = climb(density, grips, way.table_cost, num_steps)
+            else:
+                grips = anneal(density, grips, way.table_cost, num_steps, generator)
+            with torch.no_grad():
+                value = density.log_likelihood(grips) - way.cost(grips)
+            if keep:
+                grips = best(grips, value, keep)
+        feasible = way.feasible(grips)
+        if not feasible.any():
+            raise RuntimeError("no feasible grasp is found: the object may be too large, too flat or out of reach")
+        grasps = way.grasps(grips[feasible], value[feasible])
+        chosen = spread(grasps, self.num_per_type, num_grasps)
+        return grasps[chosen].to_frame("camera", observation.T_world_camera)
+
+
+class Way:
+    """How a grip is come to and squeezed: the demonstrated path carried over rigidly, and what stands in its way."""
+
+    def __init__(
+        self, demonstrations: Sequence[Demonstration], hand: Hand, cloud: Tensor, generator: torch.Generator
+    ) -> None:
+        self.hand = hand
+        self.points = cloud[torch.randperm(len(cloud), generator=generator)[:NUM_OBSTACLES]]
+        self.types = torch.tensor([d.grasp_type for d in demonstrations])
+        keys = torch.cat([d.grasp.waypoints[:, [PREGRASP, GRIP, SQUEEZE]] for d in demonstrations])
+        poses = pose_matrix(keys[..., :3], keys[..., 3:7])
+        self.relative = torch.linalg.inv(poses[:, 1:2]) @ poses  # (demo, key, 4, 4) in the palm frame at the grip
+        self.joints = hand.reduce(keys[..., 7:27])
+
+    def keyframes(self, grips: Grips) -> tuple[Tensor, Tensor]:
+        """Wrist poses (n, 3, 4, 4) and free joints (n, 3, 15) at pre-grasp, grip and squeeze."""
+        wrist = grips.wrist[:, None] @ self.relative[grips.demo]
+        far = torch.cdist(grips.wrist[:, :3, 3], self.points).amin(-1)
+        back = wrist[:, 0, :3, 3] - grips.wrist[:, :3, 3]
+        length = back.norm(dim=-1).clamp_min(1e-6)
+        share = ((MAX_REACH - far) / length).clamp(0, 1)
+        start = torch.cat((wrist[:, 0, :, :3], torch.cat((grips.wrist[:, :3, 3] + share[:, None] * back, torch.ones_like(share)[:, None]), -1)[..., None]), -1)
+        shown = self.joints[grips.demo]
+        joints = torch.stack((shown[:, 0], grips.joints, self.hand.clamp(grips.joints + shown[:, 2] - shown[:, 1])), 1)
+        return torch.cat((start[:, None], wrist[:, 1:]), 1), joints
+
+    def table_cost(self, grips: Grips) -> Tensor:
+        """Log-likelihood that links too near to the table cost, at the pre-grasp and at the grip."""
+        low = self._clearance(grips, (0.0, 1.0))
+        return TABLE_COST * (2 * MIN_CLEARANCE - low).clamp_min(0).sum(-1)
+
+    def cost(self, grips: Grips) -> Tensor:
+        """Kopicki's cost of collisions with the observed points on the way, besides that of the table."""
+        links = self._links(grips, COLLISION_STEPS)
+        depth = (-self.hand.signed_distance(links, self.points).amin(-2)).clamp_min(0)
+        weight = torch.tensor(COLLISION_WEIGHTS)[:, None]
+        return self.table_cost(grips) + (weight * (torch.expm1(100 * depth))).sum((-1, -2)) * 10
+
+    def feasible(self, grips: Grips) -> Tensor:
+        """(n,) whether every link keeps clear of the table all the way."""
+        with torch.no_grad():
+            return self._clearance(grips, tuple(np.linspace(0, 1, 7))).amin(-1) > MIN_CLEARANCE
+
+    def grasps(self, grips: Grips, log_likelihood: Tensor) -> Grasps:
+        """The grips with their paths, in the world frame."""
+        wrist, joints = self.keyframes(grips)
+        return Grasps.from_keyframes(
+            wrist[..., :3, 3], rotation.from_matrix(wrist[..., :3, :3]), self.hand.expand(joints), self.types[grips.demo],
+            "world", log_likelihood,
+        )  # fmt: skip
+
+    def _links(self, grips: Grips, at: Sequence[float]) -> Tensor:
+        """(n, step, link, 4, 4) link poses on the way, at fractions of it from the pre-grasp to the grip.
+
+        The wrist does not turn on the way, so that its pose is the grip's but for the place.
+        """
+        wrist, joints = self.keyframes(grips)
+        t = wrist.new_tensor(at)[:, None]
+        place = torch.lerp(wrist[:, :1, :3, 3], wrist[:, 1:2, :3, 3], t)
+        quaternion = rotation.from_matrix(wrist[:, :2, :3, :3])
+        turn = rotation.slerp(quaternion[:, :1], quaternion[:, 1:], t[:, 0].expand(len(place), -1))
+        posture = torch.lerp(joints[:, :1], joints[:, 1:2], t)
+        return pose_matrix(place, turn)[:, :, None] @ self.hand.forward_kinematics(self.hand.expand(posture))
+
+    def _clearance(self, grips: Grips, at: Sequence[float]) -> Tensor:
+        return self.hand.clearance(self._links(grips, at), grips.wrist.new_tensor([0.0, 0.0, 1.0, 0.0])).amin(-1)
+
+
+def best(grips: Grips, value: Tensor, num: int) -> Grips:
+    """The `num` grips of highest value of each demonstration."""
+    parts = []
+    for demo in grips.demo.unique():
+        rows = (grips.demo == demo).nonzero().squeeze(-1)
+        parts.append(rows[value[rows].topk(min(num, len(rows))).indices])
+    return grips[torch.cat(parts)]
+
+
+def spread(grasps: Grasps, num_per_type: int, num: int) -> Tensor:
+    """Indices of the likeliest, passing over those within 1 cm and 0.2 rad of a better one of the type."""
+    assert grasps.log_likelihood is not None
+    grip, taken, chosen = grasps.waypoints[:, GRIP], torch.zeros(NUM_TYPES, dtype=torch.long), list[int]()
+    for index in grasps.log_likelihood.argsort(descending=True, stable=True).tolist():
+        kind = int(grip[index, 27])
+        if taken[kind] >= num_per_type or len(chosen) == num:
+            continue
+        near = (grip[chosen, :3] - grip[index, :3]).norm(dim=-1) < 0.01
+        near &= (grip[chosen, 3:7] * grip[index, 3:7]).sum(-1).abs() > np.cos(0.1)
+        near &= grip[chosen, 27] == kind
+        if not near.any():
+            chosen.append(index)
+            taken[kind] += 1
+    return torch.tensor(chosen)

@@ -1,0 +1,85 @@
+"""Improve grips on a density: by simulated annealing, as Kopicki's generator does, or by gradient through the hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.stats import vonmises_fisher
+from torch import Tensor
+
+from dexzoo import rotation
+from dexzoo.generators.density import GraspDensity, Grips
+from dexzoo.grasp import pose_matrix, step_pose
+
+WRIST_STEP, TURN_CONCENTRATION, JOINT_STEP = 0.003, 500.0, 0.015708
+"""Proposals of the annealing at full temperature: metres, concentration on the sphere of quaternions, radians."""
+TEMPERATURE = 0.05
+"""Log-likelihood that is given away with probability 1/e at full temperature."""
+RATES = (0.002, 0.02, 0.01)
+"""Adam's steps: metres and radians of the wrist, radians of the joints."""
+REFRESH = 25
+"""Steps for which the neighbouring kernels of a grip are kept."""
+
+Cost = Callable[[Grips], Tensor]
+
+
+def climb(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int) -> Grips:
+    """Gradient ascent (Adam) on ln likelihood - cost, over the wrist's tangent space and the free joints."""
+    tangent = torch.zeros(len(grips.demo), 6, requires_grad=True)
+    change = torch.zeros_like(grips.joints, requires_grad=True)
+    scale = torch.tensor([RATES[0]] * 3 + [RATES[1]] * 3)
+    optimizer = torch.optim.Adam([tangent, change], lr=1.0)
+
+    def moved() -> Grips:
+        joints = density.hand.clamp(grips.joints + RATES[2] * change)
+        return Grips(grips.demo, step_pose(grips.wrist, scale * tangent), joints)
+
+    near = density.neighbours(grips)
+    for step in range(num_steps):
+        if step and step % REFRESH == 0:
+            with torch.no_grad():
+                near = density.neighbours(moved())
+        for group in optimizer.param_groups:
+            group["lr"] = 1 - 0.9 * step / num_steps
+        optimizer.zero_grad()
+        now = moved()
+        loss = cost(now).sum() - density.log_likelihood(now, near).sum()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+    with torch.no_grad():
+        return moved()
+
+
+def anneal(
+    density: GraspDensity, grips: Grips, cost: Cost, num_steps: int, generator: torch.Generator
+) -> Grips:
+    """Simulated annealing with Kopicki's schedule: the temperature falls linearly from 1 to 0.1, and with it the steps."""
+    count = len(grips.demo)
+    value = near = None
+    rng = np.random.default_rng(int(torch.randint(2**31, (1,), generator=generator)))
+    for step in range(num_steps):
+        heat = 1 - 0.9 * step / max(num_steps - 1, 1)
+        if step % REFRESH == 0:
+            near = density.neighbours(grips)
+            value = density.log_likelihood(grips, near) - cost(grips)
+        shift = heat * WRIST_STEP * torch.randn(count, 3, generator=generator)
+        turn = vonmises_fisher([1.0, 0, 0, 0], TURN_CONCENTRATION).rvs(count, random_state=rng)
+        turn = rotation.exp(heat * rotation.log(rotation.normalize(torch.tensor(turn, dtype=torch.float32))))
+        wrist = grips.wrist @ pose_matrix(torch.zeros(count, 3), turn)
+        wrist = torch.cat((wrist[:, :3, :3], wrist[:, :3, 3:] + shift[..., None]), -1)
+        wrist = torch.cat((wrist, grips.wrist[:, 3:]), -2)
+        joints = density.hand.clamp(
+            grips.joints + heat * JOINT_STEP * torch.randn(grips.joints.shape, generator=generator)
+        )
+        proposal = Grips(grips.demo, wrist, joints)
+        proposed = density.log_likelihood(proposal, near) - cost(proposal)
+        accept = torch.rand(count, generator=generator) < ((proposed - value) / (TEMPERATURE * heat)).exp()
+        grips = Grips(
+            grips.demo,
+            torch.where(accept[:, None, None], proposal.wrist, grips.wrist),
+            torch.where(accept[:, None], proposal.joints, grips.joints),
+        )
+        value = torch.where(accept, proposed, value)
+    return grips
