@@ -67,14 +67,41 @@ def counts() -> str:
     data = read("data")
     objects = ", ".join(f"{count} {split}" for split, count in data["objects"].items())
     lines = [
-        f"{data['grasps']:,} grasps in {data['scenes']} scenes with {data['views']} views; objects: {objects}. "
-        f"{percent(data['hold'])} hold; {data['collided']} hit the table, {data['unstable']} were unstable, "
-        f"{data['duplicates']} are duplicates.\n"
+        f"{data['grasps']:,} grasps in {data['scenes']:,} scenes with {data['views']:,} views, {data['megabytes']:.0f} "
+        f"MB; objects: {objects}. {percent(data['hold'])} hold; {data['collided']} hit the table or a block, "
+        f"{data['starts_inside']} would start inside the object, {data['unstable']} were unstable. "
+        f"{data['duplicates']} are duplicates, {data['outside_limits']} leave the limits of the joints.\n",
+        f"Scenes tried and left out: {skipped(data['skipped'])}. With theirs, {percent(data['hold_of_all_generated'])} "
+        "of all generated grasps hold.\n",
     ]
-    for name in ("split", "source", "category", "type"):
+    names = {"split": "split", "source": "source", "category": "category", "type": "type", "rank": "place in the order"}
+    for name, head in names.items():
         rows = [(value, f"{row['grasps']:,}", percent(row["hold"])) for value, row in data[f"by_{name}"].items()]
-        lines.append(table((name, "grasps", "hold"), rows))
+        lines.append(table((head, "grasps" if name in ("split", "source") else "generated grasps", "hold"), rows))
+    again, repeated = data.get("tried_again"), data["repeated"]
+    if again:
+        lines.append(
+            f"{again['grasps']} grasps tried again: {percent(again['agree_at_working_setting'])} of the labels come "
+            f"out the same at the working setting, {percent(again['agree_at_reference_setting'])} at the reference "
+            f"({1000 * again['reference']['timestep']:g} ms).\n"
+        )
+    if repeated:
+        lines.append(
+            f"{repeated['grasps']:,} grasps were repeated under drawn mass, friction and wrist error: "
+            f"{percent(repeated['always_the_same'])} always hold or always fail, and who knew each rate would be right "
+            f"in {percent(repeated['best_accuracy'])} of the trials.\n"
+        )
+    made = data["configuration"]
+    physics = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in made["physics"].items())
+    lines.append(
+        f"Made with: generator {made['generator']}, {made['num_grasps']} grasps asked for and {made['num_views']} "
+        f"views a scene, seed {made['seed']}, {made['trials']} trial(s) of each grasp; physics: {physics}.\n"
+    )
     return "\n".join(lines)
+
+
+def skipped(reasons: dict[str, int]) -> str:
+    return ", ".join(f"{count} ({reason})" for reason, count in reasons.items()) or "none"
 
 
 def page() -> str:
