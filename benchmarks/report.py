@@ -106,7 +106,7 @@ def skipped(reasons: dict[str, int]) -> str:
 
 def page() -> str:
     em2, refine, simulator, meshes = read("em2"), read("refine"), read("simulator"), read("meshes")
-    kinematics = read("kinematics")
+    kinematics, collect = read("kinematics"), read("collect")
     parts = [
         "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
         "bootstrap over scenes.\n",
@@ -196,6 +196,25 @@ def page() -> str:
                 for name, row in kinematics["distances"]["seconds"].items()
             ],
         ),
+        f"## Collecting\n\n`benchmarks/collect.py`; {collect['scenes']} small scenes with the {collect['generator']} "
+        f"generator on {collect['processors']} processors.\n",
+        table(
+            ("scenes made by", "an hour", "the same files as one worker"),
+            [
+                (name, f"{value:,.0f}", {True: "yes", False: "no", None: ""}[same])
+                for (name, value), same in zip(
+                    collect["scenes_per_hour"].items(),
+                    (None, collect["same_files_as_1_worker"]["2"], collect["same_files_as_1_worker"]["ray"]),
+                    strict=True,
+                )
+            ],
+        ),
+        f"Two workers over one: {collect['two_over_one']:.2f}. Killed {len(collect['kills'])} times at random moments "
+        "and started again, the collection ended with "
+        f"{'the same' if collect['same_files_as_1_worker']['killed'] else 'other'} files. Grasps loaded a second in "
+        "batches of "
+        + ", ".join(f"{size}: {value:,.0f}" for size, value in collect["grasps_loaded_per_second"].items())
+        + ".\n",
         f"## Meshes from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no part of "
         "dexzoo, 50 grasps each from one view, 0.2 kg, friction 0.7. At least one grasp holds for "
         f"{meshes['objects_with_a_grasp_that_holds']} of {len(meshes['objects'])}.\n",
