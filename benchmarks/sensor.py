@@ -18,7 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from dexzoo import plots
-from dexzoo.camera import IMAGE_SIZE, Observation, colourise
+from dexzoo.camera import IMAGE_SIZE, Camera, Observation, colourise
 from dexzoo.sensor import BASELINE, read_depth
 from dexzoo.sim import Scene
 from dexzoo.sim.rays import RayCaster
@@ -26,7 +26,7 @@ from dexzoo.sim.shapes import make_object
 
 LIKE_THE_REAL = ("mug", "bowl", "bottle")
 OBJECTS_EACH = 4
-SAMPLES = ("mug_01", "bowl_02", "bottle_03", "teapot_01", "cup_03", "fork_02", "pan_01", "scissors_01")
+SAMPLES = ("mug_01", "bowl_02", "bottle_03", "teapot_01", "cup_03", "spoon_02", "pan_01", "scissors_01")
 DISTANCES = ((0.35, 0.45), (0.45, 0.55), (0.55, 0.7), (0.7, 0.9))
 BANDS = ((0, 2), (2, 4), (4, 8))
 SIDES = ("left", "right", "top", "bottom")
@@ -108,8 +108,7 @@ def table_noise(frame: Frame, low: float, high: float) -> dict[str, float]:
     error = np.where(chosen, observation.depth - plane, 0)
     weight = ndimage.gaussian_filter(chosen.astype(float), 12)
     local = np.where(chosen, error - ndimage.gaussian_filter(error, 12) / np.maximum(weight, 1e-3), 0)
-    focal = observation.camera.fx
-    disparity = focal * BASELINE * local / np.where(chosen, plane, 1) ** 2
+    disparity = Camera().fx * BASELINE * local / np.where(chosen, plane, 1) ** 2
     levels = np.unique(np.round(observation.depth[chosen], 6))
     inner = levels[(levels > np.quantile(levels, 0.4)) & (levels < np.quantile(levels, 0.6))]
     return {
@@ -204,9 +203,9 @@ def picture(folder: Path, names: list[str], real: list[Frame], seed: int) -> plo
         photograph = cv2.imread(str(folder / f"{name}_color.jpg"))[..., ::-1]
         cells += [crop(photograph, frame.mask), *views(observation)]
         titles += [f"REAL {name}: photo", "depth as read", *channel_names()]
-    for name in SAMPLES:
-        scene = Scene.place(make_object(name), seed)
-        cells += [plots.depth_picture(scene.observe(seed, ideal=True).aimed()), *views(scene.observe(seed))]
+    for view, name in enumerate(SAMPLES, seed):
+        scene = Scene.place(make_object(name), seed + 2)  # where the cup tumbles
+        cells += [plots.depth_picture(scene.observe(view, ideal=True).aimed()), *views(scene.observe(view))]
         titles += [f"SIMULATED {name}: ideal", "depth as read", *channel_names()]
     return plots.grid(cells, titles, columns=5)
 

@@ -232,12 +232,14 @@ class Observation:
         table = np.append(self.table[:3] @ turn, self.table[3])
         return Observation(depth, virtual, T, table, mask)
 
-    def image(self) -> Float[Tensor, "2 224 224"]:
+    def image(self, keep_table: bool = False) -> Float[Tensor, "2 224 224"]:
         """What an evaluator sees: the object's depth and its height over the table, metres; 0 at all other pixels.
 
-        Call it on an `aimed` observation.
+        Call it on an `aimed` observation. keep_table: keep all pixels that have a reading; the shipped evaluators
+        were trained without.
         """
-        return torch.from_numpy(np.where(self.mask, np.stack((self.depth, self.height)), 0).astype(np.float32))
+        shown = self.depth > 0 if keep_table else self.mask
+        return torch.from_numpy(np.where(shown, np.stack((self.depth, self.height)), 0).astype(np.float32))
 
 
 def colourise(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view 3 height width"]:

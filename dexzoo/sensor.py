@@ -24,12 +24,12 @@ MAX_DISTURBED = 1 / 3
 """Share of the window's dots that may be missing or of a nearer surface, before the pixel is lost."""
 DOT_DENSITY = 1 / 9
 """Dots a pixel; ours. So few dots make edges ragged."""
-SURFACE_STEP = 1.0
+SURFACE_STEP = 1.5
 """Pixels of disparity by which a dot must be nearer to be of another surface; ours."""
-MAX_SLOPE = 0.5
+MAX_SLOPE = 1.0
 """Pixels of disparity from one pixel to the next, beyond which a surface's dots are torn too far apart; ours.
 
-So steep is a surface 0.6 m away that is seen at less than 15 degrees."""
+So steep is a surface 0.6 m away that is seen at less than 7 degrees."""
 
 
 def read_depth(
@@ -39,10 +39,10 @@ def read_depth(
 
     depth: (height, width) exact depth in m, 0 = nothing there.
     lit: (height, width) the pixels whose point the projector reaches; all others have no reading.
-    Of the rest those are lost in whose window more than a third of the dots are unlit, or nearer by more than a pixel
-    of disparity: the farther side of depth edges, and rims of shadows. Dots of a farther surface do not disturb (ours:
-    real frames lose hardly any pixel on the nearer side of an edge). Surfaces seen at a grazing angle are lost too.
-    What is left has Gaussian noise and steps in its disparity.
+    Of the rest those are lost in whose window more than a third of the dots are unlit, or nearer by more than 1.5
+    pixels of disparity: the farther side of depth edges, and rims of shadows. Dots of a farther surface do not disturb
+    (ours: real frames lose hardly any pixel on the nearer side of an edge). Surfaces seen at a grazing angle are lost
+    too. What is left has Gaussian noise and steps in its disparity.
     """
     height, width = depth.shape
     there = depth > 0

@@ -231,6 +231,16 @@ def test_image_is_the_objects_depth_and_height(ball: Observation) -> None:
     np.testing.assert_array_equal(image[0][aimed.mask], aimed.depth[aimed.mask])
 
 
+def test_the_table_can_be_kept_in_the_image(ball: Observation) -> None:
+    aimed = ball.aimed()
+    image, whole = aimed.image(), aimed.image(keep_table=True)
+    np.testing.assert_array_equal(whole[0], aimed.depth)
+    np.testing.assert_array_equal(whole[:, aimed.mask], image[:, aimed.mask])
+    off = (aimed.depth > 0) & ~aimed.mask
+    assert off.sum() > aimed.mask.sum()
+    assert whole[1][off].abs().max() < 0.0081, "all else is table"
+
+
 # --- colour ----------------------------------------------------------------------------------------------------------
 
 

@@ -70,4 +70,6 @@ def test_the_figures_are_those_that_the_benchmarks_wrote() -> None:
     assert report["with_figures"](README, report["summary"]()) == README
     card = (ROOT / "docs" / "data.md").read_text()
     assert report["with_figures"](card, report["counts"]()) == card
+    views = (ROOT / "docs" / "sensor.md").read_text()
+    assert report["with_figures"](views, report["sensor"]()) == views
     assert (ROOT / "docs" / "results.md").read_text() == report["page"]()

@@ -9,7 +9,7 @@ import trimesh
 
 from dexzoo.hand import Hand
 from dexzoo.sim import ObjectModel, Scene
-from dexzoo.sim.placement import FINGER_CLEARANCE, SUPPORT_HEIGHT
+from dexzoo.sim.placement import FINGER_CLEARANCE
 from dexzoo.sim.shapes import make_object
 from dexzoo.sim.world import Support
 
@@ -83,7 +83,7 @@ def test_the_hand_meets_the_block(hand: Hand) -> None:
     data = mujoco.MjData(model)
     wrist = model.joint("wrist").qposadr[0]
     data.qpos[model.joint("object").qposadr[0] + 2] = 1.0  # out of the way
-    data.qpos[wrist : wrist + 7] = [0, 0, SUPPORT_HEIGHT / 2, 1, 0, 0, 0]
+    data.qpos[wrist : wrist + 7] = [0, 0, scene.support.half[2], 1, 0, 0, 0]
     mujoco.mj_forward(model, data)
     pairs = [{model.geom(i).name for i in pair} for pair in data.contact.geom]
     assert any("support" in pair and "table" not in pair for pair in pairs)
@@ -92,14 +92,15 @@ def test_the_hand_meets_the_block(hand: Hand) -> None:
 @pytest.mark.parametrize("category", ["fork", "plate"])
 def test_the_mask_is_the_objects_alone(category: str) -> None:
     scene = Scene.place(SUPPORTED[category], 2)
+    top = 2 * scene.support.half[2]
     for seed in range(3):
         observation = scene.observe(seed=seed, ideal=True)
         # of what is seen within the block's outline, below the object, nothing belongs to the object
-        assert observation.points_world[:, 2].min() > SUPPORT_HEIGHT - 2e-3
+        assert observation.points_world[:, 2].min() > top - 2e-3
         heights = observation.height[~observation.mask]
         if category == "fork":  # a plate hides its block from above
-            assert ((heights > 0.005) & (heights < SUPPORT_HEIGHT + 1e-4)).sum() > 50, "the block is seen"
-        assert heights.max() < SUPPORT_HEIGHT + 1e-4, "and nothing of the object is left out"
+            assert ((heights > 0.005) & (heights < top + 1e-4)).sum() > 50, "the block is seen"
+        assert heights.max() < top + 1e-4, "and nothing of the object is left out"
 
 
 def test_things_of_no_such_category_lie_on_the_table() -> None:
@@ -116,7 +117,7 @@ def test_a_scene_is_made_again_of_its_fields(hand: Hand) -> None:
     for name in ("geom_pos", "geom_quat", "geom_size", "geom_friction", "body_mass", "body_inertia", "qpos0"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), name)
     assert again.observe(seed=4).depth.tobytes() == scene.observe(seed=4).depth.tobytes()
-    np.testing.assert_array_equal(support.mesh.bounds[:, 2], [0, SUPPORT_HEIGHT])
+    np.testing.assert_array_equal(support.mesh.bounds[:, 2], [0, 2 * scene.support.half[2]])
 
 
 def upright(scene: Scene) -> bool:

@@ -71,9 +71,9 @@ def test_the_farther_side_of_an_edge_is_lost_and_the_nearer_kept() -> None:
     assert 1 < lost.sum() < 2, "pixels of the table beside a straight edge"
 
 
-def test_a_step_of_less_than_a_pixel_of_disparity_is_no_edge() -> None:
+def test_a_small_step_of_disparity_is_no_edge() -> None:
     depth = np.full((480, 640), 0.7)
-    depth[:, 320:] = 0.69  # 0.9 pixels
+    depth[:, 320:] = 0.685  # 1.35 pixels
     assert (read(depth) > 0).all()
 
 
@@ -96,7 +96,7 @@ def test_a_shadow_takes_no_rim_from_what_casts_it() -> None:
     assert (read(depth, lit)[:, 340:] > 0).all()
 
 
-@pytest.mark.parametrize(("degrees", "is_read"), [(8, False), (12, False), (25, True), (60, True)])
+@pytest.mark.parametrize(("degrees", "is_read"), [(3, False), (5, False), (25, True), (60, True)])
 def test_a_surface_at_a_grazing_angle_is_lost(degrees: float, is_read: bool) -> None:
     # a plane 0.6 m away in the image's middle, whose disparity is linear in the row
     rays = CAMERA.directions()

@@ -135,7 +135,7 @@ class GraspDensity:
         self.kernel_position = torch.zeros(count, most, num_kernels, 3)
         self.kernel_quaternion = torch.zeros(count, most, num_kernels, 4)
         self.kernel_quaternion[..., 0] = 1
-        self.log_weight = torch.full((count, most, num_kernels), -torch.inf)
+        self.log_weight = torch.zeros(count, most, num_kernels)
         for row, links in enumerate(models):
             for column, model in enumerate(links):
                 self.links[row, column], self.active[row, column] = model.link, True
@@ -156,7 +156,7 @@ class GraspDensity:
         rows = torch.arange(len(self.demonstrations)).repeat_interleave(num)
         column = _draw(self.active.float(), rows, generator)
         width = self.links.shape[1]
-        kernel = _draw(self.log_weight.exp().flatten(0, 1).nan_to_num_(), rows * width + column, generator)
+        kernel = _draw(self.log_weight.exp().flatten(0, 1), rows * width + column, generator)
         place = (rows, column, kernel)
         step = torch.randn(len(rows), 3, generator=generator)
         away = self.widths.position * torch.randn(len(rows), 1, generator=generator)

@@ -13,7 +13,7 @@ import yaml
 from torch import Tensor
 
 from dexzoo import rotation
-from dexzoo.grasp import GRASP_TYPES, NUM_JOINTS, Grasps, pose_matrix
+from dexzoo.grasp import GRASP_TYPES, Grasps, pose_matrix
 from dexzoo.hand import Hand
 
 STANDOFF = 0.09
@@ -21,6 +21,9 @@ STANDOFF = 0.09
 SQUEEZE = 0.523
 """Radians that the joint which closes furthest goes on from the grip to the squeeze (30 degrees: the thesis' simulator)."""
 _LEVELS = 60
+_NUM_POINTS = 20_000
+_REACH = 0.25  # metres from the wrist that the fingers cannot pass
+_TOLERANCE = 0.001
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,9 @@ def _read(name: str, entry: dict[str, Any], hand: Hand, where: str) -> Preshape:
     try:
         wrist = entry["wrist"]
         quaternion = rotation.normalize(torch.tensor(wrist["quaternion"], dtype=torch.float32))
+        fingers = dict.fromkeys(joint.split("_")[0] for joint in hand.freedoms)
         postures = [
-            torch.tensor([angle for finger in hand.spec.fingers for angle in entry[key][finger]], dtype=torch.float32)
+            torch.tensor([angle for finger in fingers for angle in entry[key][finger]], dtype=torch.float32)
             for key in ("open", "closed")
         ]
         approach = torch.nn.functional.normalize(torch.tensor(entry["approach"], dtype=torch.float32), dim=0)
@@ -74,18 +78,58 @@ def _read(name: str, entry: dict[str, Any], hand: Hand, where: str) -> Preshape:
 def close(preshape: Preshape, mesh: trimesh.Trimesh, hand: Hand) -> Grasps:
     """The grasp, in the mesh's frame, whose fingers stop where they first touch.
 
-    Each finger closes evenly until one of its links touches the mesh; where that is its first link, the others go on.
-    From the grip, each joint goes on to the squeeze in proportion to how far it came, the furthest by 0.523 rad.
+    Each finger closes evenly until one of its links touches the mesh; where that is its first, the others go on. From
+    the grip on, each flexing joint goes as it came, the one that came furthest by 0.523 rad.
+    Raises ValueError when the open hand is in the mesh, or the thumb or all the other fingers miss it.
     """
-    points, _ = trimesh.sample.sample_surface(mesh, 20_000, seed=0)
+    points, _ = trimesh.sample.sample_surface(mesh, _NUM_POINTS, seed=0)
     cloud = torch.tensor(np.array(points), dtype=torch.float32)
-    near = cloud[(cloud - preshape.wrist[:3, 3]).norm(dim=-1) < 0.25]
-    grip = preshape.closed.clone()
-    fingers = [name.split("_")[0] for name in hand.freedoms]
-    begin = preshape.opened
-    for _ in range(2):
-        levels = torch.linspace(0, 1, _LEVELS)[:, None]
-        postures = torch.lerp(begin, preshape.closed, levels)
-        links = preshape.wrist @ hand.forward_kinematics(hand.expand(postures))
-        touch = hand.signed_distance(links, near).amin(-1) < 0
-    raise NotImplementedError
+    cloud = cloud[(cloud - preshape.wrist[:3, 3]).norm(dim=-1) < _REACH]
+    where = f"preshape {GRASP_TYPES[preshape.grasp_type]} on {preshape.object}"
+    if not len(cloud) or not _distance(preshape, preshape.opened[None], cloud, hand).min() > -_TOLERANCE:
+        raise ValueError(f"{where}: the open hand is in the object or out of reach of it; move the wrist")
+    grip, touching = preshape.opened.clone(), list[str]()
+    for finger in dict.fromkeys(name.split("_")[0] for name in hand.freedoms):
+        joints = [i for i, name in enumerate(hand.freedoms) if name.startswith(finger)]
+        links = [i for i, name in enumerate(hand.solid_names) if name.startswith(finger)]
+        grip, touched = _bend(preshape, grip, joints, links, cloud, hand)
+        if touched == links[0]:
+            grip, _ = _bend(preshape, grip, joints[-1:], links[1:], cloud, hand)
+        if touched is not None:
+            touching.append(finger)
+    if "thumb" not in touching or len(touching) < 2:
+        raise ValueError(f"{where}: only {', '.join(touching) or 'nothing'} touches the object; move the wrist")
+    return _path(preshape, grip, hand)
+
+
+def _bend(
+    preshape: Preshape, posture: Tensor, joints: list[int], links: list[int], cloud: Tensor, hand: Hand
+) -> tuple[Tensor, int | None]:
+    """Move some joints towards closed until one of some links touches: the posture, and that link, if any did."""
+    end = posture.clone()
+    end[joints] = preshape.closed[joints]
+    way = torch.lerp(posture, end, torch.linspace(0, 1, _LEVELS)[:, None])
+    touch = _distance(preshape, way, cloud, hand)[:, links] < 0
+    if not touch.any():
+        return end, None
+    level = int(touch.any(1).int().argmax())
+    return way[level], links[int(touch[level].int().argmax())]
+
+
+def _distance(preshape: Preshape, postures: Tensor, cloud: Tensor, hand: Hand) -> Tensor:
+    """(posture, solid) distances of the links to the nearest point of the object."""
+    links = preshape.wrist @ hand.forward_kinematics(hand.expand(postures))
+    return hand.signed_distance(links, cloud).amin(-1)
+
+
+def _path(preshape: Preshape, grip: Tensor, hand: Hand) -> Grasps:
+    """Pre-grasp, grip and squeeze of one grasp."""
+    came = grip - preshape.opened
+    came[[i for i, name in enumerate(hand.freedoms) if name.endswith("_abd")]] = 0
+    squeeze = hand.clamp(grip + came * (SQUEEZE / came.abs().max().clamp_min(1e-3)))
+    pregrasp = preshape.wrist.clone()
+    pregrasp[:3, 3] += STANDOFF * (preshape.wrist[:3, :3] @ preshape.approach)
+    position = torch.stack((pregrasp[:3, 3], preshape.wrist[:3, 3], preshape.wrist[:3, 3]))[None]
+    quaternion = rotation.from_matrix(preshape.wrist[:3, :3]).expand(1, 3, 4)
+    joints = hand.expand(torch.stack((preshape.opened, grip, squeeze)))[None]
+    return Grasps.from_keyframes(position, quaternion, joints, torch.tensor([preshape.grasp_type]), "world")

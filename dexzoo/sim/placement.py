@@ -14,13 +14,15 @@ from dexzoo.sim.world import WORKING, Support, make_world
 TRIES = 3
 MAX_SIZE = 0.5
 """Largest extent in metres of an object that a scene holds: what a camera 0.4 m away still sees most of."""
-SUPPORT_HEIGHT = 0.04
 FINGER_CLEARANCE = 0.022
 """What a supported object keeps from the table, in metres: a finger's thickness."""
 LONG = ("fork", "knife", "scissors", "spatula", "spoon")
 """Categories of long flat things; they lie on a block of 70 % of their width and up to 40 % of their length."""
+LONG_HEIGHT = 0.055
+"""Metres of that block's height, so high since a spoon or a spatula lies on it with one end down."""
 WIDE = ("dustpan", "pan", "plate")
 """Categories whose rim would lie too low for fingers; they lie on a square block of half their smaller extent."""
+WIDE_HEIGHT = 0.04
 DROP = 0.005
 SETTLE_TIME = 4.0
 _STILL, _STILL_TIME = 0.01, 0.1  # m/s and rad/s, and for how many seconds together
@@ -67,10 +69,10 @@ def support_for(obj: ObjectModel) -> Support | None:
         reach = np.abs(obj.mesh.bounds[:, axis] - obj.inertia[0][axis]).min()
         half = 0.35 * extents
         half[axis] = max(min(0.2 * extents[axis], reach - FINGER_CLEARANCE), 0.01)
-        return Support((float(half[0]), float(half[1]), SUPPORT_HEIGHT / 2), 0.0)
+        return Support((float(half[0]), float(half[1]), LONG_HEIGHT / 2), 0.0)
     if obj.category in WIDE:
         side = float(extents.min()) / 4
-        return Support((side, side, SUPPORT_HEIGHT / 2), 0.0)
+        return Support((side, side, WIDE_HEIGHT / 2), 0.0)
     return None
 
 
@@ -81,7 +83,7 @@ def _settle(obj: ObjectModel, support: Support | None, quaternion: NDArray[np.fl
     flat = np.zeros(9)
     mujoco.mju_quat2Mat(flat, quaternion)
     turn = flat.reshape(3, 3)
-    top = 0.0 if support is None else SUPPORT_HEIGHT
+    top = 0.0 if support is None else 2 * support.half[2]
     data.qpos[:2] = -(turn @ obj.inertia[0])[:2]
     data.qpos[2] = top + DROP - _lowest(obj, turn)
     data.qpos[3:] = quaternion
