@@ -33,7 +33,7 @@ SMALL = Configuration(seed=3, num_grasps=10, num_views=2)
 def make_small(patch: pytest.MonkeyPatch) -> None:
     """Few grasps of two objects, made in this process."""
     patch.setattr(module, "make_generator", lambda name: HeuristicGenerator(num_samples=300))
-    patch.setattr(module, "object_of", lambda number, split: ("can_02", "box_00")[number % 2])
+    patch.setattr(module, "object_of", lambda number, split: ("can_02", "box_04")[number % 2])
     patch.setattr(module, "in_processes", lambda function, numbers, workers: map(function, numbers))
     module._generator.cache_clear()
 
@@ -53,7 +53,7 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
         make_small(patch)
         told = list(collect(folder, SMALL, 2))
     module._generator.cache_clear()
-    assert [line.split(":")[0] for line in told] == ["scene 0 can_02", "scene 1 box_00"]
+    assert [line.split(":")[0] for line in told] == ["scene 0 can_02", "scene 1 box_04"]
     return folder
 
 
@@ -155,8 +155,8 @@ def test_a_worker_that_dies_is_reported() -> None:
 
 
 def test_rows_say_what_was_done(read: GraspSet, hand: Hand) -> None:
-    assert read.scenes["object"].to_pylist() == ["can_02", "box_00"]
-    assert read.scenes["split"].to_pylist() == [split_of("can_02"), split_of("box_00")]
+    assert read.scenes["object"].to_pylist() == ["can_02", "box_04"]
+    assert read.scenes["split"].to_pylist() == [split_of("can_02"), split_of("box_04")]
     for scene in read.scenes.to_pylist():
         assert scene["seed"] == SMALL.seed
         assert MASS_RANGE[scene["category"]][0] <= scene["mass"] <= MASS_RANGE[scene["category"]][1]
@@ -229,7 +229,7 @@ def test_scenes_that_give_up_are_kept_as_such(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(module, "_generator", lambda name: Hopeless())
     assert list(collect(tmp_path, SMALL, 1)) == ["scene 0 can_02: skipped, fewer than 10 grasps are generated"]
     monkeypatch.setattr(module.Scene, "place", restless)
-    assert list(collect(tmp_path, SMALL, 2))[1] == "scene 1 box_00: skipped, the object does not come to rest"
+    assert list(collect(tmp_path, SMALL, 2))[1] == "scene 1 box_04: skipped, the object does not come to rest"
     assert list(collect(tmp_path, SMALL, 2)) == ["scene 0 is there already", "scene 1 is there already"]
     counts = json.loads((tmp_path / "manifest.json").read_text())["counts"]
     assert counts["skipped"] == {
