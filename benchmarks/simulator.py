@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 import torch
 
-from dexzoo.data.collect import perturb
+from dexzoo.data.neighbours import perturb
 from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import Grasps
 from dexzoo.hand import default_hand
@@ -100,7 +100,7 @@ def candidates(scene: Scene, num: int) -> Grasps:
     outcomes = trial.run(scene, grasps, HAND)
     held = np.flatnonzero(outcomes.success)
     if len(held):
-        near = perturb(rng.choice(held, 2 * num), grasps, HAND, rng)
+        near = perturb(grasps[rng.choice(held, 2 * num)], HAND, rng)
         outcomes = trial.Outcomes.concatenate([outcomes, trial.run(scene, near, HAND)])
         grasps = Grasps.concatenate([Grasps(grasps.waypoints, "world"), near])
     tried = ~outcomes.collided & ~outcomes.starts_inside & ~outcomes.unstable
