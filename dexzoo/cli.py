@@ -23,11 +23,14 @@ from dexzoo.data.collect import ALL, Configuration, collect
 from dexzoo.data.schema import SPLITS
 from dexzoo.data.writer import MANIFEST, read_manifest
 from dexzoo.generators import list_generators
+from dexzoo.generators.demonstration import Demonstration
+from dexzoo.generators.preshape import close, read_preshapes, read_recording
 from dexzoo.grasp import GRASP_TYPES, GRIP, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.models.zoo import list_models, model_class, shipped_card
 from dexzoo.planning import Plan, plan
 from dexzoo.refinement import refine
+from dexzoo.resources import resource
 from dexzoo.sim import ObjectModel, Scene
 from dexzoo.sim.shapes import make_object
 from dexzoo.verification import verify
@@ -146,6 +149,14 @@ def _parser() -> ArgumentParser:
     command.add_argument("--num_views", type=PositiveInt, default=4, help="views of each scene")
     command.add_argument("--trials", type=PositiveInt, default=1, help="more than 1: repetitions behind success_rate")
     command.add_argument("--images", action="store_true", help="keep the depth images; else rendered anew")
+
+    command = add("demonstrate", "Make demonstrations for the Kopicki generator, and try each ten times in simulation.")
+    command.add_argument("--preshapes", type=Path, help="YAML of preshapes to close; default: those of dlr2")
+    command.add_argument(
+        "--recording", type=Path, help="JSON of waypoints in the frame of --mesh, in place of preshapes"
+    )
+    command.add_argument("--mesh", type=Path, help="mesh of the recording's object, metres, z up")
+    command.add_argument("--out", type=Path, required=True, help="folder for the demonstrations (.safetensors)")
 
     command = add("view", "Show a hand in the browser, with a slider for each free joint, until interrupted.")
     command.add_argument("--hand", default="dlr2", help="name in robots/, or a folder with a URDF and a hand.yaml")
@@ -296,6 +307,34 @@ def _collect(options: Namespace) -> Result:
     return summary, _pairs("grasp set", {**counts, "skipped": sum(counts["skipped"].values()), "out": options.out})
 
 
+def _demonstrate(options: Namespace) -> Result:
+    _check_folder(options.out)
+    if (options.recording is None) != (options.mesh is None) or (options.recording and options.preshapes):
+        raise ValueError("demonstrate takes --preshapes, or --recording together with --mesh")
+    hand = default_hand()
+    if options.recording is not None:
+        obj = ObjectModel.from_mesh(options.mesh)
+        shown = [(obj, read_recording(options.recording, hand))]
+    else:
+        preshapes = options.preshapes or resource("robots") / "dlr2" / "demonstrations" / "preshapes.yaml"
+        shown = []
+        for preshape in read_preshapes(preshapes, hand):
+            obj = make_object(preshape.object)
+            shown.append((obj, close(preshape, obj.mesh, hand)))
+    rows = []
+    table = Table("demonstration", "object", "holds", title="demonstrations, each tried ten times")
+    for obj, grasp in track(shown, "trying demonstrations", console=_err, disable=not _err.is_terminal):
+        name = GRASP_TYPES[int(grasp.grasp_type[0])]
+        demonstration = Demonstration.record(grasp, obj.mesh, hand, obj.name)
+        scene = Scene.place(obj, options.seed)
+        rate = verify(grasp.moved(scene.T_world_object), scene, options.seed, trials=10).success_rate
+        options.out.mkdir(parents=True, exist_ok=True)
+        demonstration.save(options.out / f"{name}.safetensors")
+        rows.append({"name": name, "object": obj.name, "success_rate": round(float(rate[0]), 2)})
+        table.add_row(name, obj.name, f"{rate[0]:.0%}")
+    return {"demonstrations": rows}, table
+
+
 def _view(options: Namespace) -> Result:
     view(options.hand, options.side, options.port, options.seed)
     return {}, None
@@ -328,6 +367,7 @@ _COMMANDS: dict[str, Callable[[Namespace], Result]] = {
     "refine": _refine,
     "verify": _verify,
     "collect": _collect,
+    "demonstrate": _demonstrate,
     "view": _view,
     "models": _models,
 }

@@ -176,6 +176,11 @@ class Grasps:
             T = torch.linalg.inv(T)
         return replace(self, waypoints=transform_waypoints(T.to(self.waypoints), self.waypoints), frame=frame)
 
+    def moved(self, motion: Tensor | np.ndarray) -> Grasps:
+        """The grasps carried along by a rigid motion (4, 4) within their frame, as when the object under them moves."""
+        T = rotation.check_pose(motion, "motion").to(self.waypoints)
+        return replace(self, waypoints=transform_waypoints(T, self.waypoints))
+
     def save(self, path: str | Path) -> None:
         """Write to a safetensors file, frame included."""
         tensors = {"waypoints": self.waypoints.detach().float().contiguous()}

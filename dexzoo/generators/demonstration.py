@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,14 +15,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dexzoo import rotation
 from dexzoo.generators.features import Features
-from dexzoo.grasp import GRASP_TYPES, GRIP, JOINTS, PREGRASP, SQUEEZE, Grasps
+from dexzoo.grasp import GRIP, Grasps
 from dexzoo.hand import Hand
 from dexzoo.resources import resource
+from dexzoo.segmentation import MIN_POINTS
 
-REACH = 0.02
+REACH = 0.012
 """Metres from the hand within which the surface is kept; the contact models' receptive field is smaller."""
+MAX_SURFACE_DIFFERENCE, MAX_JOINT_DIFFERENCE = 0.006, 0.15
+"""Metres and radians within which two demonstrations are near-equal."""
+MAX_GAP = 0.005
 SPACING = 0.0015
 """Metres between the points that a mesh is known by."""
 
@@ -30,21 +34,18 @@ SPACING = 0.0015
 class Demonstration:
     """One grasp of a known object, and the surface near the hand at its grip, all in the object's frame.
 
-    grasp: one Grasps in the "world" frame, which is the object's. surface: features near the hand at the grip.
+    object: its name. grasp: one Grasps whose "world" frame is the object's. surface: features near the hand at the grip.
     """
 
-    name: str
     object: str
     grasp: Grasps
     surface: Features
 
     @classmethod
-    def record(
-        cls, grasp: Grasps, mesh: trimesh.Trimesh, hand: Hand, name: str = "", object_name: str = ""
-    ) -> Demonstration:
-        """From a grasp in the frame of a watertight mesh.
+    def record(cls, grasp: Grasps, mesh: trimesh.Trimesh, hand: Hand, name: str = "object") -> Demonstration:
+        """From a grasp in the frame of the mesh of an object of that name, its faces turned outwards.
 
-        Raises ValueError when the hand touches nothing at the grip.
+        Raises ValueError when the hand is not at the object at the grip.
         """
         hand.check(grasp.joints)
         num = int(np.clip(mesh.area / SPACING**2, 2_000, 100_000))
@@ -52,16 +53,18 @@ class Demonstration:
         links = grasp.wrist_pose[0, GRIP].double() @ hand.forward_kinematics(grasp.joints[0, GRIP].double())
         distance = hand.signed_distance(links, torch.tensor(np.array(points))).amin(0)
         near = np.asarray(distance < REACH)
-        if near.sum() < 10 or distance.min() > 0.005:
+        if near.sum() < MIN_POINTS or distance.min() > MAX_GAP:
             raise ValueError(
-                f"demonstration {name}: the hand is {float(distance.min()) * 1000:.0f} mm from the object at the grip"
+                f"demonstration on {name}: the hand is {1000 * float(distance.min()):.0f} mm from the object at the grip; "
+                "give the grasp in the frame of the mesh, in metres"
             )
-        return cls(
-            name or GRASP_TYPES[int(grasp.grasp_type[0])],
-            object_name,
-            grasp,
-            Features.of_surface(np.array(points), mesh.face_normals[faces], near),
-        )
+        return cls(name, grasp, Features.of_surface(np.array(points), mesh.face_normals[faces], near))
+
+    def near_surface(self) -> Float[Tensor, "point 3"]:
+        """The surface under the hand in the frame of the palm at the grip: what tells one contact from another."""
+        pose = torch.linalg.inv(self.grasp.wrist_pose[0, GRIP])
+        points: Tensor = self.surface.points @ pose[:3, :3].T + pose[:3, 3]
+        return points
 
     @property
     def grasp_type(self) -> int:
@@ -76,7 +79,7 @@ class Demonstration:
             "frames": self.surface.quaternion.contiguous(),
             "curvature": self.surface.curvature.contiguous(),
         }
-        save_file(tensors, str(path), {"format": "dexzoo.demonstration.1", "name": self.name, "object": self.object})
+        save_file(tensors, str(path), {"format": "dexzoo.demonstration.1", "object": self.object})
 
     @classmethod
     def load(cls, path: str | Path) -> Demonstration:
@@ -90,7 +93,7 @@ class Demonstration:
         except SafetensorError as error:
             raise ValueError(f"{path} is no demonstration ({error}); write it with Demonstration.save") from None
         surface = Features(tensors["points"], tensors["frames"], tensors["curvature"])
-        return cls(about.get("name", ""), about.get("object", ""), Grasps(tensors["waypoints"], "world"), surface)
+        return cls(about.get("object", ""), Grasps(tensors["waypoints"], "world"), surface)
 
 
 @lru_cache(maxsize=4)
@@ -101,3 +104,23 @@ def load_demonstrations(folder: str = "") -> tuple[Demonstration, ...]:
     if not paths:
         raise FileNotFoundError(f"folder {where} holds no demonstration; make some with python -m dexzoo demonstrate")
     return tuple(Demonstration.load(path) for path in paths)
+
+
+def distinct(demonstrations: Sequence[Demonstration], max_per_type: int) -> list[Demonstration]:
+    """Those that differ in what they touch or how; of near-equal ones of a type the first is kept.
+
+    Near-equal: the surfaces under the hand lie within 6 mm of each other on average, and no joint differs by 0.15 rad.
+    """
+    kept: list[Demonstration] = []
+    for one in demonstrations:
+        like = [other for other in kept if other.grasp_type == one.grasp_type]
+        if len(like) < max_per_type and not any(_near_equal(one, other) for other in like):
+            kept.append(one)
+    return kept
+
+
+def _near_equal(a: Demonstration, b: Demonstration) -> bool:
+    if (a.grasp.joints[0, GRIP] - b.grasp.joints[0, GRIP]).abs().max() > MAX_JOINT_DIFFERENCE:
+        return False
+    apart = torch.cdist(a.near_surface()[::4], b.near_surface()[::4])
+    return bool((apart.amin(0).mean() + apart.amin(1).mean()) / 2 < MAX_SURFACE_DIFFERENCE)

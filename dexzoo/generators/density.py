@@ -215,7 +215,7 @@ class GraspDensity:
         return self.kernel_position[place], self.kernel_turn[place], self.log_weight[place]
 
     def log_likelihood(self, grips: Grips, near: tuple[Tensor, Tensor, Tensor] | None = None) -> Float[Tensor, " grip"]:
-        """ln of the product of experts (thesis, equation 3.2); differentiable in the grips."""
+        """Ln of the product of experts (thesis, equation 3.2); differentiable in the grips."""
         near = self.neighbours(grips) if near is None else near
         position, turn = self._link_poses(grips)
         apart = (near[0] - position[..., None, :]).square().sum(-1) / self.widths.position**2
@@ -227,7 +227,7 @@ class GraspDensity:
         return contact + self.log_posture(grips)
 
     def log_posture(self, grips: Grips) -> Float[Tensor, " grip"]:
-        """ln C: how near the posture is to the demonstrated path, and how near on it to the grip.
+        """Ln C: how near the posture is to the demonstrated path, and how near on it to the grip.
 
         The path runs from t = -1 at the pre-grasp by the grip at 0 as far again to t = 1, with weight exp(-|t|), and
         Gaussian kernels stand on it without gaps: what counts is the nearest.
@@ -249,7 +249,7 @@ class GraspDensity:
 def _log_kernel(
     position: Tensor, turn: Tensor, kernel_position: Tensor, kernel_turn: Tensor, widths: Bandwidths
 ) -> Float[Tensor, "n kernel"]:
-    """ln of all kernels at all poses, by two matrix products."""
+    """Ln of all kernels at all poses, by two matrix products."""
     s = 1 / widths.position
     a, b = position * s, kernel_position * s
     apart = a.square().sum(-1)[:, None] + b.square().sum(-1) - 2 * a @ b.T

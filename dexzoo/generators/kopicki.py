@@ -22,6 +22,7 @@ from dexzoo.generators.generator import GraspGenerator
 from dexzoo.generators.search import anneal, climb
 from dexzoo.grasp import GRIP, NUM_TYPES, PREGRASP, SQUEEZE, Grasps, pose_matrix
 from dexzoo.hand import Hand, default_hand
+from dexzoo.segmentation import MAX_DEPTH, MIN_HEIGHT
 
 NUM_FEATURES = 1000
 MIN_CLEARANCE = 0.002
@@ -30,7 +31,7 @@ MAX_REACH = 0.24
 """Metres that the wrist may be from the nearest observed point at the pre-grasp; the stand-off is shortened for it."""
 COLLISION_STEPS, COLLISION_WEIGHTS = (0.0, 0.4, 0.7, 0.9), (1.0, 1.0, 0.5, 0.2)
 """Where on the way from the pre-grasp (0) to the grip (1) collisions are looked at, and how much they count."""
-NUM_OBSTACLES = 300
+NUM_POINTS = 300
 TABLE_COST = 1000.0
 """Log-likelihood that a metre below the least clearance costs."""
 
@@ -47,8 +48,8 @@ class KopickiGenerator(GraspGenerator):
         self,
         demonstrations: Sequence[Demonstration] | None = None,
         num_per_type: int = 10,
-        num_samples: int = 1000,
-        num_kernels: int = 5000,
+        num_samples: int = 10_000,
+        num_kernels: int = 50_000,
         widths: Bandwidths | None = None,
         search: Literal["gradient", "annealing"] = "gradient",
         num_steps: tuple[int, int] = (20, 40),
@@ -56,7 +57,9 @@ class KopickiGenerator(GraspGenerator):
     ) -> None:
         self.hand: Hand = default_hand()
         self.demonstrations = list(demonstrations or load_demonstrations())
-        self.num_per_type, self.num_samples, self.num_kernels = num_per_type, num_samples, num_kernels
+        share = len(self.demonstrations)
+        self.num_per_type = num_per_type
+        self.num_samples, self.num_kernels = max(num_samples // share, 50), max(num_kernels // share, 500)
         self.widths, self.search, self.num_steps = widths or Bandwidths(), search, num_steps
         self.completes = completes
         self.models = [contact_models(d, self.hand, self.widths) for d in self.demonstrations]
@@ -80,11 +83,11 @@ class KopickiGenerator(GraspGenerator):
             raise ValueError(f"num_grasps is {num_grasps}, expected at least 1")
         generator = torch.Generator().manual_seed(seed)
         density = self.density(observation, seed)
-        way = Way(self.demonstrations, self.hand, density.surface.points, generator)
+        way = Way(self.demonstrations, self.hand, density.surface.points, obstacles(observation), generator)
         with torch.no_grad():
             grips = density.sample(self.num_samples, generator)
-            grips = best(grips, density.screen(grips) - way.table_cost(grips), self.num_samples // 20)
-        for num_steps, keep in zip(self.num_steps, (3 * self.num_per_type, None), strict=True):
+            grips = best(grips, density.screen(grips) - way.table_cost(grips), max(self.num_samples // 20, 10))
+        for num_steps, keep in zip(self.num_steps, (max(300 // len(self.demonstrations), 8), None), strict=True):
             if self.search == "gradient":
                 grips = climb(density, grips, way.table_cost, num_steps)
             else:
@@ -105,10 +108,16 @@ class Way:
     """How a grip is come to and squeezed: the demonstrated path carried over rigidly, and what stands in its way."""
 
     def __init__(
-        self, demonstrations: Sequence[Demonstration], hand: Hand, cloud: Tensor, generator: torch.Generator
+        self,
+        demonstrations: Sequence[Demonstration],
+        hand: Hand,
+        cloud: Tensor,
+        others: Tensor,
+        generator: torch.Generator,
     ) -> None:
         self.hand = hand
-        self.points = cloud[torch.randperm(len(cloud), generator=generator)[:NUM_OBSTACLES]]
+        self.points = _some(cloud, NUM_POINTS, generator)
+        self.others = _some(others, NUM_POINTS, generator)
         self.types = torch.tensor([d.grasp_type for d in demonstrations])
         keys = torch.cat([d.grasp.waypoints[:, [PREGRASP, GRIP, SQUEEZE]] for d in demonstrations])
         poses = pose_matrix(keys[..., :3], keys[..., 3:7])
@@ -174,7 +183,26 @@ class Way:
         return pose_matrix(place, turn)[:, :, None] @ self.hand.forward_kinematics(self.hand.expand(posture))
 
     def _clearance(self, grips: Grips, at: Sequence[float]) -> Tensor:
-        return self.hand.clearance(self._links(grips, at), grips.wrist.new_tensor([0.0, 0.0, 1.0, 0.0])).amin(-1)
+        """(n, step) metres to the table, or to what else is seen on it."""
+        links = self._links(grips, at)
+        clearance = self.hand.clearance(links, grips.wrist.new_tensor([0.0, 0.0, 1.0, 0.0])).amin(-1)
+        if len(self.others):
+            clearance = torch.minimum(clearance, self.hand.signed_distance(links, self.others).amin((-1, -2)))
+        return clearance
+
+
+def obstacles(observation: Observation) -> Tensor:
+    """(n, 3) what is seen above the table besides the object, in the world frame, one point in each centimetre."""
+    other = (observation.height > MIN_HEIGHT) & (observation.depth < MAX_DEPTH) & ~observation.mask
+    cloud = observation.camera.directions()[other] * observation.depth[other][:, None]
+    T = observation.T_world_camera
+    points = cloud @ T[:3, :3].T + T[:3, 3]
+    _, first = np.unique(np.floor(points / 0.01), axis=0, return_index=True)
+    return torch.tensor(points[first], dtype=torch.float32)
+
+
+def _some(points: Tensor, num: int, generator: torch.Generator) -> Tensor:
+    return points[torch.randperm(len(points), generator=generator)[:num]]
 
 
 def best(grips: Grips, value: Tensor, num: int) -> Grips:

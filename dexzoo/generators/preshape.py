@@ -1,7 +1,11 @@
-"""Author a demonstration: bring the hand to a known mesh in a given preshape and close it until it touches."""
+"""Author a demonstration: bring the hand to a known mesh in a given preshape and close it until it touches.
+
+Or take one from a recording: where the wrist was and how the fingers were bent, on the way and at the grip.
+"""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +23,7 @@ from dexzoo.hand import Hand
 STANDOFF = 0.09
 """Metres from the pre-grasp to the grip."""
 SQUEEZE = 0.523
-"""Radians that the joint which closes furthest goes on from the grip to the squeeze (30 degrees: the thesis' simulator)."""
+"""Radians that the joint which closes furthest goes on from the grip to the squeeze (the thesis' 30 degrees)."""
 _LEVELS = 60
 _NUM_POINTS = 20_000
 _REACH = 0.25  # metres from the wrist that the fingers cannot pass
@@ -32,7 +36,7 @@ class Preshape:
 
     object: name of a known object, or its mesh file. wrist: (4, 4) pose of the palm at the grip in the object's frame.
     opened, closed: (15,) free joints to begin with and to close towards, rad; a finger for which they are equal stays
-    as it is. approach: (3,) direction in the palm frame in which the pre-grasp lies.
+    as it is. approach: (3,) metres from the grip to the pre-grasp in the palm frame.
     """
 
     grasp_type: int
@@ -70,9 +74,10 @@ def _read(name: str, entry: dict[str, Any], hand: Hand, where: str) -> Preshape:
             torch.tensor([angle for finger in fingers for angle in entry[key][finger]], dtype=torch.float32)
             for key in ("open", "closed")
         ]
-        approach = torch.nn.functional.normalize(torch.tensor(entry["approach"], dtype=torch.float32), dim=0)
+        direction = torch.tensor(entry["approach"], dtype=torch.float32)
+        approach = STANDOFF * torch.nn.functional.normalize(direction, dim=0)
         pose = pose_matrix(torch.tensor(wrist["position"], dtype=torch.float32), quaternion)
-        return Preshape(GRASP_TYPES.index(name), str(entry["object"]), pose, *postures, approach)
+        return Preshape(GRASP_TYPES.index(name), str(entry["object"]), pose, postures[0], postures[1], approach)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{where} lacks or misspells {error}; it needs object, wrist, open, closed, approach"
@@ -132,8 +137,42 @@ def _path(preshape: Preshape, grip: Tensor, hand: Hand) -> Grasps:
     came[[i for i, name in enumerate(hand.freedoms) if name.endswith("_abd")]] = 0
     squeeze = hand.clamp(grip + came * (SQUEEZE / came.abs().max().clamp_min(1e-3)))
     pregrasp = preshape.wrist.clone()
-    pregrasp[:3, 3] += STANDOFF * (preshape.wrist[:3, :3] @ preshape.approach)
+    pregrasp[:3, 3] += preshape.wrist[:3, :3] @ preshape.approach
     position = torch.stack((pregrasp[:3, 3], preshape.wrist[:3, 3], preshape.wrist[:3, 3]))[None]
     quaternion = rotation.from_matrix(preshape.wrist[:3, :3]).expand(1, 3, 4)
     joints = hand.expand(torch.stack((preshape.opened, grip, squeeze)))[None]
     return Grasps.from_keyframes(position, quaternion, joints, torch.tensor([preshape.grasp_type]), "world")
+
+
+def read_recording(path: str | Path, hand: Hand) -> Grasps:
+    """One grasp, in the frame of its object, from a JSON file.
+
+    {"grasp_type": name, "waypoints": [{"position": [3], "quaternion": [4], "joints": [15 or 20]}, ...]}: the wrist in
+    metres and wxyz, the free joints or all in radians. The first waypoint is the pre-grasp, the last the grip; the
+    squeeze goes on from there as in `close`.
+    Raises FileNotFoundError or ValueError that says what is wrong.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"recording {path} does not exist")
+    try:
+        recorded = json.loads(Path(path).read_text())
+        kind = GRASP_TYPES.index(recorded["grasp_type"])
+        ends = [recorded["waypoints"][0], recorded["waypoints"][-1]]
+        position, quaternion, joints = (
+            torch.tensor([end[key] for end in ends], dtype=torch.float32)
+            for key in ("position", "quaternion", "joints")
+        )
+        if joints.shape[1] == len(hand.joint_names):
+            joints = hand.reduce(joints)
+        poses = pose_matrix(position, rotation.normalize(quaternion))
+        approach = poses[1, :3, :3].T @ (poses[0, :3, 3] - poses[1, :3, 3])
+        if not 0.01 < approach.norm() < 0.5:
+            raise ValueError(f"the first waypoint lies {approach.norm():.3f} m from the last, expected 0.01 to 0.5 m")
+        preshape = Preshape(kind, str(path), poses[1], joints[0], joints[1], approach)
+        hand.check(hand.expand(joints))
+    except (ValueError, KeyError, IndexError, TypeError, RuntimeError) as error:
+        raise ValueError(
+            f"recording {path} cannot be read: {error}; "
+            "it needs grasp_type and waypoints of position, quaternion, joints"
+        ) from None
+    return _path(preshape, joints[1], hand)

@@ -46,20 +46,21 @@ def climb(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int) -> Gr
         optimizer.zero_grad()
         now = moved()
         loss = cost(now).sum() - density.log_likelihood(now, near).sum()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimizer.step()
     with torch.no_grad():
         return moved()
 
 
 def anneal(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int, generator: torch.Generator) -> Grips:
-    """Simulated annealing with Kopicki's schedule: the temperature falls linearly from 1 to 0.1, and with it the steps."""
+    """Simulated annealing as Kopicki's: the temperature falls linearly from 1 to 0.1, and with it the steps."""
     count = len(grips.demo)
-    value = near = None
+    near = density.neighbours(grips)
+    value = density.log_likelihood(grips, near) - cost(grips)
     rng = np.random.default_rng(int(torch.randint(2**31, (1,), generator=generator)))
     for step in range(num_steps):
         heat = 1 - 0.9 * step / max(num_steps - 1, 1)
-        if step % REFRESH == 0:
+        if step and step % REFRESH == 0:
             near = density.neighbours(grips)
             value = density.log_likelihood(grips, near) - cost(grips)
         shift = heat * WRIST_STEP * torch.randn(count, 3, generator=generator)
