@@ -22,7 +22,7 @@ from torch import Tensor
 from dexzoo import rotation
 from dexzoo.generators.demonstration import Demonstration
 from dexzoo.generators.features import Features
-from dexzoo.grasp import GRIP, PREGRASP, pose_matrix
+from dexzoo.grasp import GRIP, PREGRASP, Grasps, pose_matrix
 from dexzoo.hand import Hand
 
 
@@ -47,6 +47,8 @@ MIN_CONTACT = 50
 """Surface points under a link from which on it counts as in contact."""
 MAX_CONTACT = 400
 """Kernels of a contact model; more points are thinned out."""
+REFERENCE_KERNELS = 5000
+"""Kernels that a query density's weights add up to, however many it is made of; Kopicki's number."""
 _CHUNK = 256
 
 
@@ -143,7 +145,7 @@ class GraspDensity:
                 position, quaternion, weight = _query(model, surface, num_kernels, self.widths.curvature, generator)
                 self.kernel_position[row, column] = position
                 self.kernel_quaternion[row, column] = quaternion
-                self.log_weight[row, column] = (weight / weight.max()).log()
+                self.log_weight[row, column] = (REFERENCE_KERNELS * weight / weight.sum()).log()
         self.kernel_turn = rotation.to_matrix(self.kernel_quaternion).flatten(-2)
         joints = torch.cat([d.grasp.joints[:, [PREGRASP, GRIP]] for d in demonstrations])
         self.grip, self.closing = joints[:, 1], joints[:, 1] - joints[:, 0]
@@ -193,6 +195,7 @@ class GraspDensity:
                 total[rows] += link - math.log(self.floor)
         return total
 
+    @torch.no_grad()
     def neighbours(self, grips: Grips, num: int = 24) -> tuple[Tensor, Tensor, Tensor]:
         """The kernels that matter near each grip: positions (n, l, num, 3), turns (n, l, num, 9), ln weights (n, l, num).
 
@@ -213,6 +216,20 @@ class GraspDensity:
                     index[part, column] = logs.topk(shape[-1], sorted=False).indices
         place = (grips.demo[:, None, None], torch.arange(shape[1])[:, None], index)
         return self.kernel_position[place], self.kernel_turn[place], self.log_weight[place]
+
+    def log_density(self, grasps: Grasps) -> Float[Tensor, " grasp"]:
+        """ln of the likelihood of grasps in the frame of the surface (the world), by their grips; differentiable.
+
+        Where several demonstrations are of a grasp's type their likelihoods add up; where none is, it is -inf.
+        """
+        if grasps.frame != "world":
+            raise ValueError('log_density takes grasps in the "world" frame; use to_frame first')
+        wrist, joints = grasps.wrist_pose[:, GRIP], self.hand.reduce(grasps.joints[:, GRIP])
+        types = torch.tensor([d.grasp_type for d in self.demonstrations])
+        like = grasps.grasp_type[:, None] == types
+        grasp, demo = like.nonzero(as_tuple=True)
+        each = self.log_likelihood(Grips(demo, wrist[grasp], joints[grasp]))
+        return torch.full(like.shape, -torch.inf).index_put((grasp, demo), each).logsumexp(-1)
 
     def log_likelihood(self, grips: Grips, near: tuple[Tensor, Tensor, Tensor] | None = None) -> Float[Tensor, " grip"]:
         """Ln of the product of experts (thesis, equation 3.2); differentiable in the grips."""
