@@ -15,7 +15,8 @@ import torch
 from torchmetrics.functional.classification import binary_auroc
 
 import dexzoo
-from dexzoo.data.schema import SPLITS, GraspSet
+from dexzoo.data.grasp_set import GraspSet
+from dexzoo.data.schema import SPLITS
 from dexzoo.grasp import Grasps
 
 NUM_BOOTSTRAP = 1000

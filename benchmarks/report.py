@@ -69,14 +69,41 @@ def counts() -> str:
     data = read("data")
     objects = ", ".join(f"{count} {split}" for split, count in data["objects"].items())
     lines = [
-        f"{data['grasps']:,} grasps in {data['scenes']} scenes with {data['views']} views; objects: {objects}. "
-        f"{percent(data['hold'])} hold; {data['collided']} hit the table, {data['unstable']} were unstable, "
-        f"{data['duplicates']} are duplicates.\n"
+        f"{data['grasps']:,} grasps in {data['scenes']:,} scenes with {data['views']:,} views, {data['megabytes']:.0f} "
+        f"MB; objects: {objects}. {percent(data['hold'])} hold; {data['collided']} hit the table or a block, "
+        f"{data['starts_inside']} would start inside the object, {data['unstable']} were unstable. "
+        f"{data['duplicates']} are duplicates, {data['outside_limits']} leave the limits of the joints.\n",
+        f"Scenes tried and left out: {skipped(data['skipped'])}. With theirs, {percent(data['hold_of_all_generated'])} "
+        "of all generated grasps hold.\n",
     ]
-    for name in ("split", "source", "category", "type"):
+    names = {"split": "split", "source": "source", "category": "category", "type": "type", "rank": "place in the order"}
+    for name, head in names.items():
         rows = [(value, f"{row['grasps']:,}", percent(row["hold"])) for value, row in data[f"by_{name}"].items()]
-        lines.append(table((name, "grasps", "hold"), rows))
+        lines.append(table((head, "grasps" if name in ("split", "source") else "generated grasps", "hold"), rows))
+    again, repeated = data.get("tried_again"), data["repeated"]
+    if again:
+        lines.append(
+            f"{again['grasps']} grasps tried again: {percent(again['agree_at_working_setting'])} of the labels come "
+            f"out the same at the working setting, {percent(again['agree_at_reference_setting'])} at the reference "
+            f"({1000 * again['reference']['timestep']:g} ms).\n"
+        )
+    if repeated:
+        lines.append(
+            f"{repeated['grasps']:,} grasps were repeated under drawn mass, friction and wrist error: "
+            f"{percent(repeated['always_the_same'])} always hold or always fail, and who knew each rate would be right "
+            f"in {percent(repeated['best_accuracy'])} of the trials.\n"
+        )
+    made = data["configuration"]
+    physics = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in made["physics"].items())
+    lines.append(
+        f"Made with: generator {made['generator']}, {made['num_grasps']} grasps asked for and {made['num_views']} "
+        f"views a scene, seed {made['seed']}, {made['trials']} trial(s) of each grasp; physics: {physics}.\n"
+    )
     return "\n".join(lines)
+
+
+def skipped(reasons: dict[str, int]) -> str:
+    return ", ".join(f"{count} ({reason})" for reason, count in reasons.items()) or "none"
 
 
 def sensor() -> str:
@@ -120,7 +147,7 @@ def sensor() -> str:
 
 def page() -> str:
     em2, refine, simulator, meshes = read("em2"), read("refine"), read("simulator"), read("meshes")
-    kinematics = read("kinematics")
+    kinematics, collect = read("kinematics"), read("collect")
     parts = [
         "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
         "bootstrap over scenes.\n",
@@ -210,6 +237,25 @@ def page() -> str:
                 for name, row in kinematics["distances"]["seconds"].items()
             ],
         ),
+        f"## Collecting\n\n`benchmarks/collect.py`; {collect['scenes']} small scenes with the {collect['generator']} "
+        f"generator on {collect['processors']} processors.\n",
+        table(
+            ("scenes made by", "an hour", "the same files as one worker"),
+            [
+                (name, f"{value:,.0f}", {True: "yes", False: "no", None: ""}[same])
+                for (name, value), same in zip(
+                    collect["scenes_per_hour"].items(),
+                    (None, collect["same_files_as_1_worker"]["2"], collect["same_files_as_1_worker"]["ray"]),
+                    strict=True,
+                )
+            ],
+        ),
+        f"Two workers over one: {collect['two_over_one']:.2f}. Killed {len(collect['kills'])} times at random moments "
+        "and started again, the collection ended with "
+        f"{'the same' if collect['same_files_as_1_worker']['killed'] else 'other'} files. Grasps loaded a second in "
+        "batches of "
+        + ", ".join(f"{size}: {value:,.0f}" for size, value in collect["grasps_loaded_per_second"].items())
+        + ".\n",
         f"## Meshes from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no part of "
         "dexzoo, 50 grasps each from one view, 0.2 kg, friction 0.7. At least one grasp holds for "
         f"{meshes['objects_with_a_grasp_that_holds']} of {len(meshes['objects'])}.\n",

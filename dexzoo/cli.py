@@ -19,8 +19,10 @@ from rich.table import Table
 
 from dexzoo import plots, training
 from dexzoo.camera import Observation
-from dexzoo.data.collect import collect
-from dexzoo.data.schema import merge
+from dexzoo.data.collect import ALL, Configuration, collect
+from dexzoo.data.schema import SPLITS
+from dexzoo.data.writer import MANIFEST, read_manifest
+from dexzoo.generators import list_generators
 from dexzoo.grasp import GRASP_TYPES, GRIP, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.models.zoo import list_models, model_class, shipped_card
@@ -137,6 +139,13 @@ def _parser() -> ArgumentParser:
     command.add_argument("--out", type=Path, required=True, help="folder of the grasp set")
     command.add_argument("--scenes", type=PositiveInt, default=100, help="how many scenes")
     command.add_argument("--workers", type=PositiveInt, default=1, help="processes")
+    command.add_argument("--ray", help="instead of processes, a Ray cluster: auto, its address, or local for one here")
+    command.add_argument("--split", choices=[*SPLITS, ALL], default=ALL, help="whose objects")
+    command.add_argument("--generator", choices=list_generators(), default="heuristic", help="what proposes grasps")
+    command.add_argument("--num_grasps", type=PositiveInt, default=100, help="grasps to generate in each scene")
+    command.add_argument("--num_views", type=PositiveInt, default=4, help="views of each scene")
+    command.add_argument("--trials", type=PositiveInt, default=1, help="more than 1: repetitions behind success_rate")
+    command.add_argument("--images", action="store_true", help="keep the depth images; else rendered anew")
 
     command = add("view", "Show a hand in the browser, with a slider for each free joint, until interrupted.")
     command.add_argument("--hand", default="dlr2", help="name in robots/, or a folder with a URDF and a hand.yaml")
@@ -270,13 +279,21 @@ def _object(options: Namespace) -> ObjectModel:
 
 def _collect(options: Namespace) -> Result:
     _check_folder(options.out)
-    scenes = options.out / "scenes"
-    lines = collect(scenes, options.scenes, options.workers, options.seed)
+    configuration = Configuration(
+        options.seed,
+        options.split,
+        options.generator,
+        options.num_grasps,
+        options.num_views,
+        options.trials,
+        options.images,
+    )
+    lines = collect(options.out, configuration, options.scenes, options.workers, options.ray)
     for _ in track(lines, "collecting scenes", options.scenes, console=_err, disable=not _err.is_terminal):
         pass
-    merge(scenes, options.out)
-    summary = {"out": str(options.out), "scenes": len(list(scenes.glob("scene_*")))}
-    return summary, _pairs("grasp set", summary)
+    counts = read_manifest((options.out / MANIFEST).read_bytes(), MANIFEST)["counts"]
+    summary = {"out": str(options.out), **counts}
+    return summary, _pairs("grasp set", {**counts, "skipped": sum(counts["skipped"].values()), "out": options.out})
 
 
 def _view(options: Namespace) -> Result:

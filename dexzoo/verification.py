@@ -19,13 +19,14 @@ MASS_FACTOR, FRICTION = (0.8, 1.2), (0.5, 1.0)
 """Bounds of the drawn mass, over that of the object, and of the drawn friction (thesis, section 3.5.1)."""
 
 
-def verify(grasps: Grasps, scene: Scene, seed: int = 0, trials: int = 1) -> Outcomes:
+def verify(grasps: Grasps, scene: Scene, seed: int = 0, trials: int = 1, num_threads: int = 0) -> Outcomes:
     """Execute each grasp on the scene in MuJoCo: close, lift 1 m, hold 2 s.
 
     grasps: in the world frame, or in the camera frame of the scene's latest observation.
     trials: 1 executes each grasp as it is. More repeat it under a mass within 20 %, a friction from U[0.5, 1] and a
     wrist error, drawn anew by `seed` for each grasp and trial: `success_rate` is then the share that holds, and the
     other fields are those of the first trial.
+    num_threads: 0 uses all cores; the outcomes do not depend on it.
     Raises ValueError for joints outside their limits, or grasps in the camera frame of a scene not yet observed.
     """
     if trials < 1:
@@ -39,14 +40,14 @@ def verify(grasps: Grasps, scene: Scene, seed: int = 0, trials: int = 1) -> Outc
             )
         grasps = grasps.to_frame("world", scene.T_world_camera)
     if trials == 1:
-        return trial.run(scene, grasps, hand)
+        return trial.run(scene, grasps, hand, num_threads)
     rng = np.random.default_rng(seed)
     count = len(grasps)
     repeated = _displaced(grasps[np.tile(np.arange(count), trials)], rng)
     drawn = Variation(
         scene.object.mass * rng.uniform(*MASS_FACTOR, len(repeated)), rng.uniform(*FRICTION, len(repeated))
     )
-    outcomes = trial.run(scene, repeated, hand, variation=drawn)
+    outcomes = trial.run(scene, repeated, hand, num_threads, variation=drawn)
     rate = outcomes.success.reshape(trials, count).mean(0, dtype=np.float32)
     return replace(outcomes[:count], success_rate=rate)
 

@@ -6,13 +6,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
 from dexzoo import rotation
 from dexzoo.camera import Camera, Observation, look_at
-from dexzoo.data.schema import encode_path, encode_view, merge, write_scene
+from dexzoo.data.schema import encode_path, encode_view
+from dexzoo.data.writer import GraspSetWriter, scene_rows
 from dexzoo.grasp import Grasps
 from dexzoo.hand import default_hand
 
@@ -67,41 +67,29 @@ def draw_grasps(centre: NDArray[np.float64], count: int, rng: np.random.Generato
 
 
 def write(folder: Path, num_grasps: int = 40, num_views: int = 2, seed: int = 0) -> Path:
-    """Write a set of one scene for each entry of SPLIT_OF, each an object of its own; returns its folder."""
+    """Write a set of one scene for each entry of SPLIT_OF, each an object of its own; returns its folder.
+
+    Its views have images and no seeds, as those of recorded sets.
+    """
     rng = np.random.default_rng(seed)
-    for scene, split in enumerate(SPLIT_OF):
-        shape = ("ball", "box")[scene % 2]
-        half = np.full(3, rng.uniform(0.03, 0.05)) if shape == "ball" else rng.uniform(0.02, 0.05, 3)
-        centre = np.array([0.0, 0.0, half[2]])
-        views = [encode_view(render(shape, half, centre, camera_pose(centre, rng))) for _ in range(num_views)]
-        grasps, success = draw_grasps(centre, num_grasps, rng)
-        columns = {
-            "scene": [scene] * num_grasps,
-            "view": rng.integers(num_views, size=num_grasps).tolist(),
-            "grasp_type": grasps.grasp_type.tolist(),
-            "source": ["generated"] * num_grasps,
-            "log_likelihood": rng.normal(size=num_grasps).tolist(),
-            "path": encode_path(grasps, default_hand()).tolist(),
-            "success": success.tolist(),
-            "collided": [False] * num_grasps,
-            "unstable": [False] * num_grasps,
-            "shift": [0.0] * num_grasps,
-            "rotation": [0.0] * num_grasps,
-        }
-        row = {
-            "scene": scene,
-            "object": f"{shape}_{scene}",
-            "category": shape,
-            "split": split,
-            "mass": 0.2,
-            "friction": 0.7,
-            "scale": 1.0,
-            "seed": seed,
-            "T_world_object": np.eye(4).reshape(-1).tolist(),
-        }
-        named = [{"scene": scene, "view": view, **columns} for view, columns in enumerate(views)]
-        write_scene(folder / "scenes", row, named, pa.table(columns))
-    merge(folder / "scenes", folder)
+    with GraspSetWriter(folder, {"made by": "tests/synthetic.py", "seed": seed}, len(SPLIT_OF)) as writer:
+        for scene, split in enumerate(SPLIT_OF):
+            shape = ("ball", "box")[scene % 2]
+            half = np.full(3, rng.uniform(0.03, 0.05)) if shape == "ball" else rng.uniform(0.02, 0.05, 3)
+            centre = np.array([0.0, 0.0, half[2]])
+            views = [encode_view(render(shape, half, centre, camera_pose(centre, rng))) for _ in range(num_views)]
+            grasps, success = draw_grasps(centre, num_grasps, rng)
+            columns = {
+                "view": rng.integers(num_views, size=num_grasps),
+                "grasp_type": grasps.grasp_type.numpy(),
+                "source": ["generated"] * num_grasps,
+                "rank": np.arange(num_grasps),
+                "log_likelihood": rng.normal(size=num_grasps),
+                "path": encode_path(grasps, default_hand()),
+                "success": success,
+            }
+            row = {"scene": scene, "object": f"{shape}_{scene}", "category": shape, "split": split}
+            writer.write(scene_rows(row, views, columns))
     return folder
 
 

@@ -165,15 +165,20 @@ def test_verify_tries_a_file_of_grasps_on_a_mesh(run: Run, some_grasps: Path, tm
 
 
 def test_collect_makes_a_set_and_goes_on(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collecting, "NUM_GENERATED", 2)
-    monkeypatch.setattr(collecting, "NUM_NEIGHBOURS", 2)
-    monkeypatch.setattr(collecting, "HeuristicGenerator", lambda: HeuristicGenerator(100))
-    monkeypatch.setattr(collecting, "object_names", lambda: ["box_03"])
+    monkeypatch.setattr(collecting, "make_generator", lambda name: HeuristicGenerator(300))
+    monkeypatch.setattr(collecting, "object_of", lambda number, split: "can_02")
+    monkeypatch.setattr(collecting, "in_processes", lambda function, numbers, workers: map(function, numbers))
+    args = ["collect", "--out", tmp_path, "--num_grasps", 10, "--num_views", 1]
     for count in (1, 2):
-        status, out, err = run("collect", "--out", tmp_path, "--scenes", count, "--json")
+        status, out, err = run(*args, "--scenes", count, "--json")
         assert (status, err) == (0, "")
-        assert json.loads(out) == {"out": str(tmp_path), "scenes": count}
-    assert {path.name for path in tmp_path.glob("*.parquet")} == {"scenes.parquet", "views.parquet", "grasps.parquet"}
+        counts = json.loads(out)
+        assert counts["out"] == str(tmp_path)
+        assert counts["scenes"] + sum(counts["skipped"].values()) == count
+    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "objects", "scenes", "views", "grasps"}
+    status, out, err = run(*args, "--scenes", 2, "--seed", 1)
+    assert (status, out) == (2, "")
+    assert "was made with seed 0, not 1" in err
 
 
 def test_models_are_listed(run: Run) -> None:

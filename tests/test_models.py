@@ -345,7 +345,7 @@ def test_calls_that_are_wrong_get_one_line(arguments: list[str], tmp_path: Path)
         (["fit", "--config", "em9.yaml"], "configuration em9.yaml does not exist.*em2.yaml"),
         (["fit", "--config", "smoke.yaml", "--model.wdth", "3"], "'wdth' is not accepted"),
         (["fit", "--config=smoke.yaml", "--model.optimizer", "adam"], "optimizer 'adam' is unknown"),
-        (["fit", "--config", "smoke.yaml", "--data.folder", "nowhere"], "grasp set nowhere has no scenes.parquet"),
+        (["fit", "--config", "smoke.yaml", "--data.folder", "nowhere"], "grasp set nowhere has no scenes/.+parquet"),
         (["test", *SMOKE, *arguments, "--ckpt_path", "x.ckpt"], "checkpoint x.ckpt does not exist"),
     ]
     bad = tmp_path / "bad.ckpt"

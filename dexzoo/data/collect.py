@@ -1,159 +1,256 @@
-"""Make a grasp set: scene, views, generated grasps and their simulated neighbours, trials, rows."""
+"""Make a grasp set: object, scene, views, generated grasps, trials, simulated neighbours, trials, rows."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import replace
-from functools import partial
-from multiprocessing import get_context
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cache, partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import torch
 from torch import Tensor
 
-from dexzoo import rotation
-from dexzoo.data.schema import SCHEMAS, decode_path, encode_path, encode_view, write_scene
-from dexzoo.generators.heuristic import HeuristicGenerator
+from dexzoo import verification
+from dexzoo.camera import Observation
+from dexzoo.data.neighbours import choose, perturb
+from dexzoo.data.schema import SPLITS, decode_path, encode_path, encode_view
+from dexzoo.data.workers import in_processes, on_ray
+from dexzoo.data.writer import GraspSetWriter, SceneRows, scene_rows
+from dexzoo.generators import list_generators, make_generator
+from dexzoo.generators.generator import GraspGenerator
 from dexzoo.grasp import Grasps
-from dexzoo.hand import Hand, default_hand
+from dexzoo.hand import default_hand
 from dexzoo.sim import Outcomes, Scene, trial
 from dexzoo.sim.shapes import MASS_RANGE, make_object, object_names, split_of
+from dexzoo.sim.world import WORKING
 
-NUM_VIEWS = 4
-NUM_GENERATED = 48
-NUM_NEIGHBOURS = 48
+MIN_GENERATED = 10
+"""A scene with fewer generated grasps is skipped, and so is one where none of them holds (thesis, section 3.2)."""
+NEIGHBOUR_RATIO = 0.6
+"""Simulated neighbours for each generated grasp."""
+SCALE_RANGE, FRICTION_RANGE = (0.95, 1.05), (0.5, 1.0)
+VIEW_TRIES = 3
+ALL = "all"
+TEST_EVERY = 6
+"""With all splits, every sixth scene is of a test object, which is about their share of the objects."""
 
 
-def collect(folder: Path, num_scenes: int, workers: int = 1, seed: int = 0) -> Iterator[str]:
-    """Write scenes 0...num_scenes - 1 that are not yet in `folder`; yields a line on each, those kept first.
+@dataclass(frozen=True)
+class Configuration:
+    """What the rows of a set depend on, besides the program.
 
-    The same seed makes the same files on any number of workers. Killing it loses the scenes in flight.
+    seed: the same seed gives the same rows. split: whose objects: train, validation, test or all.
+    generator: name of the generator, which sees view 0. num_grasps: grasps that it is asked for.
+    num_views: views of each scene. trials: repetitions behind success_rate; 1 for none.
+    images: keep the depth images in the set, instead of rendering them again where it is read.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    for unfinished in folder.glob(".scene_*"):  # of a run that was killed
-        shutil.rmtree(unfinished)
-    there = {i for i in range(num_scenes) if (folder / f"scene_{i:06d}").exists()}
-    missing = [i for i in range(num_scenes) if i not in there]
-    yield from (f"scene {i} is there already" for i in sorted(there))
-    if workers == 1:
-        for index in missing:
-            yield collect_scene(folder, seed, index)
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for job in as_completed([pool.submit(partial(collect_scene, folder, seed), index) for index in missing]):
-            yield job.result()
+
+    seed: int = 0
+    split: str = ALL
+    generator: str = "heuristic"
+    num_grasps: int = 100
+    num_views: int = 4
+    trials: int = 1
+    images: bool = False
+
+    def __post_init__(self) -> None:
+        if self.split not in (*SPLITS, ALL):
+            raise ValueError(f"split {self.split!r} is unknown; use one of {', '.join((*SPLITS, ALL))}")
+        if self.generator not in list_generators():
+            raise ValueError(f"generator {self.generator!r} is unknown; use one of {', '.join(list_generators())}")
+        if self.num_grasps < MIN_GENERATED:
+            raise ValueError(f"num_grasps is {self.num_grasps}, but scenes of fewer than {MIN_GENERATED} are skipped")
+        if self.num_views < 1 or self.trials < 1:
+            raise ValueError(f"num_views is {self.num_views} and trials {self.trials}, expected at least 1 of each")
 
 
-def collect_scene(folder: Path, seed: int, index: int) -> str:
-    """Make and write one scene; returns what to tell of it."""
-    torch.set_num_threads(1)
-    rng = np.random.default_rng([seed, index])
-    names = object_names()
-    name = names[index % len(names)]
+def collect(
+    folder: Path, configuration: Configuration, num_scenes: int, workers: int = 1, ray: str | None = None
+) -> Iterator[str]:
+    """Write scenes 0 to num_scenes - 1 that are not yet in `folder`; yields a line on each, those kept first.
+
+    workers: processes of this machine. ray: the address of a cluster instead, see `workers.on_ray`.
+    The files are the same byte for byte on any number of workers. Killing it loses no more than the scenes in flight.
+    Raises what `GraspSetWriter` and `workers` raise.
+    """
+    with GraspSetWriter(folder, _describe(configuration), num_scenes, _objects(configuration.split)) as writer:
+        missing = [number for number in range(num_scenes) if number not in writer.done]
+        yield from (f"scene {number} is there already" for number in range(num_scenes) if number in writer.done)
+        make = partial(make_scene, configuration)
+        made = in_processes(make, missing, workers) if ray is None else on_ray(make, missing, ray)
+        for rows in made if missing else ():
+            writer.write(rows)
+            yield _tell(rows)
+
+
+def make_scene(configuration: Configuration, number: int) -> SceneRows:
+    """The rows of one scene, which depend on nothing else.
+
+    A scene that gives no grasps is one row with the reason in its column `skipped`.
+    """
+    rng = np.random.default_rng([configuration.seed, number])
+    name = object_of(number, configuration.split)
     obj = make_object(name)
-    scale = float(rng.uniform(0.95, 1.05))
-    obj = replace(
-        obj.scaled(scale), mass=float(rng.uniform(*MASS_RANGE[obj.category])), friction=float(rng.uniform(0.5, 1.0))
-    )
-    scene = Scene.place(obj, seed=int(rng.integers(2**31)))
-    observations = [scene.observe(seed=int(rng.integers(2**31))) for _ in range(NUM_VIEWS)]
-    hand = default_hand()
-    try:
-        generated = HeuristicGenerator().generate(observations[0], NUM_GENERATED, int(rng.integers(2**31)))
-        grasps = generated.to_frame("world", observations[0].T_world_camera)
-    except RuntimeError:  # no feasible grasp from this view: a scene of no rows
-        grasps = Grasps(torch.zeros(0, 10, 28), "world", torch.zeros(0))
-    outcomes = trial.run(scene, grasps, hand, num_threads=1)
-    source = ["generated"] * len(grasps)
-    likelihood = torch.zeros(0) if grasps.log_likelihood is None else grasps.log_likelihood
-    if len(grasps):
-        neighbours = perturb(choose(outcomes, NUM_NEIGHBOURS, rng), grasps, hand, rng)
-        outcomes = Outcomes.concatenate([outcomes, trial.run(scene, neighbours, hand, num_threads=1)])
-        grasps = Grasps.concatenate([replace(grasps, log_likelihood=None), neighbours])
-        source += ["perturbed"] * len(neighbours)
-        likelihood = torch.cat((likelihood, torch.full((len(neighbours),), torch.nan)))
+    scale = float(rng.uniform(*SCALE_RANGE))
+    mass, friction = float(rng.uniform(*MASS_RANGE[obj.category])), float(rng.uniform(*FRICTION_RANGE))
+    obj = replace(obj.scaled(scale), mass=mass, friction=friction)
     row: dict[str, Any] = {
-        "scene": index,
+        "scene": number,
         "object": name,
         "category": obj.category,
         "split": split_of(name),
-        "mass": obj.mass,
-        "friction": obj.friction,
         "scale": scale,
-        "seed": seed,
-        "T_world_object": scene.T_world_object.reshape(-1).tolist(),
+        "mass": mass,
+        "friction": friction,
+        "seed": configuration.seed,
+        "trials": configuration.trials,
+        "generated": 0,
+        "held": 0,
     }
-    views = [{"scene": index, "view": i, **encode_view(o.aimed())} for i, o in enumerate(observations)]
-    write_scene(folder, row, views, _rows(index, grasps, outcomes, source, likelihood, hand, rng))
-    held = outcomes.success.mean() if len(outcomes) else 0.0
-    return f"scene {index} {name}: {len(grasps)} grasps, {held:.0%} hold"
+    try:
+        scene = Scene.place(obj, _seed(rng))
+    except ValueError:
+        return scene_rows(row | {"skipped": "the object does not come to rest"})
+    row["T_world_object"] = scene.T_world_object.reshape(-1).tolist()
+    if scene.support is not None:
+        row |= {"support_half": list(scene.support.half), "support_yaw": scene.support.yaw}
+    views = _look(scene, configuration.num_views, rng)
+    if len(views) < configuration.num_views:
+        return scene_rows(row | {"skipped": "the object is not seen"})
+    generated = _generate(configuration, views[0][1], _seed(rng))
+    row["generated"] = len(generated)
+    if len(generated) < MIN_GENERATED:
+        return scene_rows(row | {"skipped": f"fewer than {MIN_GENERATED} grasps are generated"})
+    hand = default_hand()
+    # what is simulated is what will be read, to the last bit
+    path = encode_path(generated, hand)
+    outcomes = trial.run(scene, decode_path(path, generated.grasp_type, hand), hand, num_threads=1)
+    row["held"] = int(outcomes.success.sum())
+    if not row["held"]:
+        return scene_rows(row | {"skipped": "no generated grasp holds"})
+    parents = choose(outcomes.success, round(NEIGHBOUR_RATIO * len(path)), rng)
+    near = encode_path(perturb(generated[parents], hand, rng), hand)
+    neighbours = decode_path(near, generated.grasp_type[parents], hand)
+    outcomes = Outcomes.concatenate([outcomes, trial.run(scene, neighbours, hand, num_threads=1)])
+    rank = np.concatenate((np.arange(len(path)), parents))
+    path = np.concatenate((path, near))
+    grasp_type = generated.grasp_type[rank]
+    columns = {
+        **{field.name: getattr(outcomes, field.name) for field in fields(Outcomes)},
+        "view": rng.integers(configuration.num_views, size=len(path)),
+        "grasp_type": grasp_type.numpy(),
+        "source": ["generated"] * len(generated) + ["perturbed"] * len(near),
+        "rank": rank,
+        "log_likelihood": _likelihood(generated) + [None] * len(near),
+        "path": path,
+        "success_rate": _success_rate(decode_path(path, grasp_type, hand), scene, configuration.trials, _seed(rng)),
+    }
+    rows = [encode_view(view.aimed(), seed, configuration.images) for seed, view in views]
+    return scene_rows(row, rows, columns)
 
 
-def choose(outcomes: Outcomes, num: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of grasps whose neighbours are to be tried: two thirds around those that hold, if any do."""
-    held, failed = np.flatnonzero(outcomes.success), np.flatnonzero(~outcomes.success)
-    share = 2 * num // 3 if len(held) and len(failed) else num if len(held) else 0
-    parts = [
-        rng.choice(held, share) if share else held[:0],
-        rng.choice(failed, num - share) if num > share else failed[:0],
-    ]
-    return np.concatenate(parts)
+def object_of(number: int, split: str) -> str:
+    """The object of a scene; the objects come round in turn, the categories mixed, so that any first part is balanced.
 
-
-def perturb(index: np.ndarray, grasps: Grasps, hand: Hand, rng: np.random.Generator) -> Grasps:
-    """Neighbours of grasps: the wrist moved by 2 to 15 mm and 0.03 to 0.2 rad, each joint by up to 0.03 to 0.15 rad.
-
-    The whole path moves with the wrist; the joints of grip and squeeze change alike, those of the pre-grasp do not.
+    With all splits, five scenes are of training or validation objects, then one is of a test object.
     """
-    near = grasps[index]
-    n = len(near)
-    key = torch.tensor(encode_path(near, hand)).unflatten(-1, (3, 22))
-
-    def direction() -> Tensor:
-        return torch.nn.functional.normalize(torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32), dim=-1)
-
-    def size(low: float, high: float) -> Tensor:
-        return torch.tensor(rng.uniform(low, high, (n, 1)), dtype=torch.float32)
-
-    position = key[..., :3] + (direction() * size(0.002, 0.015))[:, None]
-    step = rotation.exp(direction() * size(0.03, 0.2))
-    quaternion = rotation.normalize(rotation.multiply(key[..., 3:7], step[:, None]))
-    change = size(0.03, 0.15) * torch.tensor(rng.uniform(-1, 1, (n, 15)), dtype=torch.float32)
-    joints = key[..., 7:].clone()
-    joints[:, 1:] += change[:, None]
-    joints = hand.clamp(joints)
-    return decode_path(torch.cat((position, quaternion, joints), -1).flatten(1), near.grasp_type, hand)
+    if split != ALL:
+        names = _mixed((split,))
+        return names[number % len(names)]
+    turn, place = divmod(number, TEST_EVERY)
+    if place == TEST_EVERY - 1:
+        return object_of(turn, "test")
+    names = _mixed(("train", "validation"))
+    return names[(turn * (TEST_EVERY - 1) + place) % len(names)]
 
 
-def _rows(
-    index: int,
-    grasps: Grasps,
-    outcomes: Outcomes,
-    source: list[str],
-    likelihood: Tensor,
-    hand: Hand,
-    rng: np.random.Generator,
-) -> pa.Table:
-    count = len(grasps)
-    path = encode_path(grasps, hand).reshape(-1)
-    return pa.table(
-        {
-            "scene": np.full(count, index, np.int32),
-            "view": rng.integers(NUM_VIEWS, size=count).astype(np.int16),
-            "grasp_type": grasps.grasp_type.numpy().astype(np.int8),
-            "source": pa.array(source, pa.string()),
-            "log_likelihood": likelihood.numpy(),
-            "path": pa.FixedSizeListArray.from_arrays(pa.array(path), 66),
-            "success": outcomes.success,
-            "collided": outcomes.collided,
-            "unstable": outcomes.unstable,
-            "shift": outcomes.shift,
-            "rotation": outcomes.rotation,
-        },
-        schema=SCHEMAS["grasps"],
-    )
+@cache
+def _mixed(splits: tuple[str, ...]) -> list[str]:
+    """The objects of some splits, those of each category spread evenly over the list."""
+    by_category: dict[str, list[str]] = {}
+    for split in splits:
+        for name in object_names(split):
+            by_category.setdefault(_category(name), []).append(name)
+    places = [
+        ((place + 0.5) / len(names), category, name)
+        for category, names in by_category.items()
+        for place, name in enumerate(names)
+    ]
+    return [name for *_, name in sorted(places)]
+
+
+def _category(name: str) -> str:
+    return name.rpartition("_")[0]
+
+
+def _objects(split: str) -> list[dict[str, Any]]:
+    """Rows of the table of objects."""
+    rows = []
+    for name in object_names(None if split == ALL else split):
+        low, high = MASS_RANGE[_category(name)]
+        row = {"object": name, "category": _category(name), "split": split_of(name)}
+        rows.append({**row, "mass_min": low, "mass_max": high})
+    return rows
+
+
+def _describe(configuration: Configuration) -> dict[str, Any]:
+    """What the manifest says of how the rows were made."""
+    return {"dexzoo": version("dexzoo"), **asdict(configuration), "physics": asdict(WORKING)}
+
+
+def _look(scene: Scene, num: int, rng: np.random.Generator) -> list[tuple[int, Observation]]:
+    """Views with their seeds; fewer than `num` where a try in three still does not show the object."""
+    views: list[tuple[int, Observation]] = []
+    for _ in range(VIEW_TRIES * num):
+        seed = _seed(rng)
+        try:
+            view = scene.observe(seed)
+            view.aimed()  # which segments it
+        except ValueError:
+            continue
+        views.append((seed, view))
+        if len(views) == num:
+            break
+    return views
+
+
+def _generate(configuration: Configuration, observation: Observation, seed: int) -> Grasps:
+    """What is generated for a view, in the world frame; nothing where the generator gives up."""
+    try:
+        grasps = _generator(configuration.generator).generate(observation, configuration.num_grasps, seed)
+    except (ValueError, RuntimeError):  # as the interface says
+        return Grasps(torch.zeros(0, 10, 28), "world")
+    return grasps.to_frame("world", observation.T_world_camera)
+
+
+@cache
+def _generator(name: str) -> GraspGenerator:
+    return make_generator(name)
+
+
+def _likelihood(grasps: Grasps) -> list[float | None]:
+    value: Tensor | None = grasps.log_likelihood
+    return [None] * len(grasps) if value is None else value.tolist()
+
+
+def _success_rate(grasps: Grasps, scene: Scene, trials: int, seed: int) -> list[float] | list[None]:
+    if trials == 1:
+        return [None] * len(grasps)
+    rate: list[float] = verification.verify(grasps, scene, seed, trials, 1).success_rate.tolist()
+    return rate
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**31))
+
+
+def _tell(rows: SceneRows) -> str:
+    row = rows["scenes"].to_pylist()[0]
+    name = f"scene {row['scene']} {row['object']}"
+    if row["skipped"]:
+        return f"{name}: skipped, {row['skipped']}"
+    held = rows["grasps"]["success"].to_numpy().mean()
+    return f"{name}: {rows['grasps'].num_rows} grasps, {held:.0%} hold"

@@ -18,7 +18,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler, SequentialSampler, WeightedRandomSampler
 
-from dexzoo.data.schema import SPLITS, TABLES, VERSION, GraspSet
+from dexzoo.data.grasp_set import GraspSet, ViewImages, user_cache
+from dexzoo.data.schema import SOURCES, SPLITS, VERSION
 from dexzoo.grasp import transform_waypoints
 from dexzoo.models.evaluator import Batch, GraspEvaluator, Scene
 from dexzoo.resources import resource
@@ -34,14 +35,14 @@ _log = logging.getLogger(__name__)
 class GraspDataset(Dataset[Batch]):
     """Whole batches by lists of indices: gathers from tensors, no work by row.
 
-    view: (num_grasps,) row of each grasp's view in `scene`, or, without one, in the set's table of views.
+    view: (num_grasps,) row of each grasp's view in `views`, which are encoded, or images.
     """
 
     def __init__(
-        self, grasps: Tensor, success: Tensor, scene_index: Tensor, view: Tensor, scene: Scene | None, source: GraspSet
+        self, grasps: Tensor, success: Tensor, scene_index: Tensor, view: Tensor, views: Scene | ViewImages
     ) -> None:
         self.grasps, self.success, self.scene_index = grasps, success, scene_index
-        self.view, self.scene, self.source = view, scene, source
+        self.view, self.views = view, views
 
     def __len__(self) -> int:
         return len(self.grasps)
@@ -50,19 +51,22 @@ class GraspDataset(Dataset[Batch]):
         rows = torch.tensor(index)
         view = self.view[rows]
         views: Scene | Tensor
-        if self.scene is None:
+        if isinstance(self.views, ViewImages):
             shown, place = view.unique(return_inverse=True)
-            views = torch.stack([self.source.observation(int(row)).image() for row in shown])[place]
+            views = self.views[shown][place]
         else:
-            views = {name: value[view] for name, value in self.scene.items()}
+            views = {name: value[view] for name, value in self.views.items()}
         return Batch(views, self.grasps[rows, None], self.success[rows], self.scene_index[rows])
 
 
 class GraspDataModule(LightningDataModule):
     """Batches of a grasp set, split by object as the set itself says.
 
-    folder: the set (`dexzoo.data.schema`); a relative one is looked up in the working folder, then beside the package.
+    folder: the set (`dexzoo.data.schema`), a folder or an address such as s3://...; a relative folder is looked up in
+    the working folder, then beside the package.
     batch_size: grasps in a batch; training draws as many successes as failures, with replacement.
+    sources: the grasps that are trained on: generated, perturbed, refined.
+    evaluation_sources: those that are validated, tested and predicted; what a user ranks is generated.
     predict_split: the split that `predict` runs over.
     num_scenes: use only the first so many scenes of each split, to try things out.
     cache: where encoded views are kept; by default the user's cache folder.
@@ -77,6 +81,8 @@ class GraspDataModule(LightningDataModule):
         self,
         folder: str = "assets/grasps",
         batch_size: int = 64,
+        sources: list[str] = SOURCES,
+        evaluation_sources: list[str] = SOURCES[:1],
         predict_split: str = "test",
         num_scenes: int | None = None,
         cache: str | None = None,
@@ -87,16 +93,20 @@ class GraspDataModule(LightningDataModule):
             raise ValueError(f"predict_split {predict_split!r} is unknown; use one of {', '.join(SPLITS)}")
         if batch_size < 1:
             raise ValueError(f"batch_size is {batch_size}, expected at least 1")
-        beside = resource(folder)
-        self.folder = beside if beside.exists() and not Path(folder).exists() else Path(folder)
+        for source in (*sources, *evaluation_sources):
+            if source not in SOURCES:
+                raise ValueError(f"source {source!r} is unknown; use some of {', '.join(SOURCES)}")
+        elsewhere = "://" in folder or Path(folder).exists() or not resource(folder).exists()
+        self.folder = folder if elsewhere else str(resource(folder))
         self.batch_size, self.predict_split, self.seed = batch_size, predict_split, seed
+        self.sources, self.evaluation_sources = sources, evaluation_sources
         self.num_scenes = num_scenes
-        self.cache = Path(cache) if cache else _user_cache()
+        self.cache = Path(cache) if cache else user_cache()
 
     @cached_property
     def source(self) -> GraspSet:
         """The set, read into memory."""
-        return GraspSet(self.folder)
+        return GraspSet(self.folder, self.cache)
 
     @cached_property
     def waypoints(self) -> Tensor:
@@ -111,27 +121,28 @@ class GraspDataModule(LightningDataModule):
 
     def fit_statistics(self, model: GraspEvaluator) -> None:
         """Set the model's standardisation from the training split."""
-        rows = self._rows("train")
+        rows = self._rows("train", self.sources)
         views = np.unique(self.source.grasp_view[rows])
         views = views[np.linspace(0, len(views) - 1, min(len(views), STATISTICS_VIEWS)).astype(int)]
-        images = torch.stack([self.source.observation(int(view)).image() for view in views])
+        images = self.source.images(views.tolist())[torch.arange(len(views))]
         model.fit_statistics(images.to(model.device), self.waypoints[rows].to(model.device))
 
-    def dataset(self, split: str, model: GraspEvaluator) -> GraspDataset:
-        """The grasps of a split, with their views encoded by the model where its encoder is frozen."""
-        rows = self._rows(split)
-        view = torch.from_numpy(self.source.grasp_view)[rows]
-        scene = None
-        if model.frozen_encoder:
-            shown, view = view.unique(return_inverse=True)
-            scene = self._encode(shown.tolist(), model)
+    def dataset(self, split: str, model: GraspEvaluator, sources: list[str] | None = None) -> GraspDataset:
+        """The grasps of a split, with their views encoded by the model where its encoder is frozen.
+
+        sources: those that are taken; by default `sources` for training and `evaluation_sources` for the rest.
+        """
+        if sources is None:
+            sources = self.sources if split == "train" else self.evaluation_sources
+        rows = self._rows(split, sources)
+        shown, view = torch.from_numpy(self.source.grasp_view)[rows].unique(return_inverse=True)
+        views = shown.tolist()
         return GraspDataset(
             self.waypoints[rows],
             torch.from_numpy(self.source.success).float()[rows],
             torch.from_numpy(self.source.grasp_scene)[rows],
             view,
-            scene,
-            self.source,
+            self._encode(views, model) if model.frozen_encoder else self.source.images(views),
         )
 
     def loader(self, dataset: GraspDataset, *, balanced: bool = False) -> DataLoader[Batch]:
@@ -164,10 +175,8 @@ class GraspDataModule(LightningDataModule):
 
     def describe(self) -> dict[str, str | int]:
         """What a model card says of the data: format version, number of training grasps, hash of the tables."""
-        digest = hashlib.sha256()
-        for name in TABLES:
-            digest.update((self.folder / f"{name}.parquet").read_bytes())
-        return {"version": VERSION, "train_grasps": len(self._rows("train")), "sha256": digest.hexdigest()}
+        count = len(self._rows("train", self.sources))
+        return {"version": VERSION, "train_grasps": count, "sha256": self.source.sha256}
 
     @property
     def _model(self) -> GraspEvaluator:
@@ -178,10 +187,12 @@ class GraspDataModule(LightningDataModule):
             )
         return model
 
-    def _rows(self, split: str) -> Tensor:
-        rows = np.flatnonzero(self.source.grasp_split == SPLITS.index(split))
+    def _rows(self, split: str, sources: list[str]) -> Tensor:
+        chosen = (self.source.grasp_split == SPLITS.index(split)) & np.isin(self.source.source, sources)
+        rows = np.flatnonzero(chosen)
         if not len(rows):
-            raise ValueError(f"grasp set {self.folder} has no grasps in its {split} split; collect more objects")
+            what = f"no {' or '.join(sources)} grasps in its {split} split"
+            raise ValueError(f"grasp set {self.folder} has {what}; collect more objects")
         if self.num_scenes is not None:
             scene = self.source.grasp_scene[rows]
             rows = rows[np.isin(scene, np.unique(scene)[: self.num_scenes])]
@@ -197,11 +208,10 @@ class GraspDataModule(LightningDataModule):
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
     def _encode_part(self, rows: list[int], model: GraspEvaluator, folder: Path) -> Scene:
-        table = self.source.views.take(rows)
         digest = hashlib.sha256()
-        for depth in table["depth"].to_pylist():
+        for depth in self.source.depth(rows):
             digest.update(depth)
-        digest.update(np.array(table["T_world_camera"].to_pylist()).tobytes())
+        digest.update(self.source.tables[rows].numpy().tobytes())
         path = folder / f"{digest.hexdigest()[:32]}.safetensors"
         try:
             return load_file(path)
@@ -209,7 +219,7 @@ class GraspDataModule(LightningDataModule):
             pass
         except SafetensorError:
             _log.warning("cached views %s cannot be read; encoding them again", path)
-        images = torch.stack([self.source.observation(row).image() for row in rows])
+        images = self.source.images(rows)[torch.arange(len(rows))]
         with torch.no_grad():
             encoded = [model.encode(part.to(model.device)) for part in images.split(16)]
         scene = {name: torch.cat([part[name] for part in encoded]).cpu().half() for name in encoded[0]}
@@ -218,10 +228,6 @@ class GraspDataModule(LightningDataModule):
         save_file(scene, temporary)
         temporary.rename(path)
         return scene
-
-
-def _user_cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dexzoo"
 
 
 def _fingerprint(model: GraspEvaluator) -> str:

@@ -10,6 +10,7 @@ orientations, which takes q and -q as one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -189,7 +190,7 @@ class GraspDensity:
                     self.kernel_turn[demo, column, :num], self.widths,
                 )  # fmt: skip
                 link = torch.logaddexp(logs.logsumexp(-1) + scale, logs.new_tensor(self.floor).log())
-                total[rows] += link * (self.links.shape[1] / len(columns))
+                total[rows] += link - math.log(self.floor)
         return total
 
     def neighbours(self, grips: Grips, num: int = 24) -> tuple[Tensor, Tensor, Tensor]:
@@ -222,8 +223,8 @@ class GraspDensity:
         logs = near[2] - apart - self.widths.concentration * (1 - cosine)
         link = torch.logaddexp(logs.logsumexp(-1), logs.new_tensor(self.floor).log())
         active = self.active[grips.demo]
-        contact = torch.where(active, link, 0.0).sum(-1) / active.sum(-1)
-        return contact * self.links.shape[1] + self.log_posture(grips)
+        contact = torch.where(active, link, 0.0).sum(-1) - active.sum(-1) * math.log(self.floor)
+        return contact + self.log_posture(grips)
 
     def log_posture(self, grips: Grips) -> Float[Tensor, " grip"]:
         """ln C: how near the posture is to the demonstrated path, and how near on it to the grip.
