@@ -30,7 +30,7 @@ from dexzoo.sim.world import REFERENCE, WORKING, Physics
 
 OFFSETS = (0.0001, 0.001, 0.003)
 BATCHES = (1, 10, 100, 1000)
-UNIFORM = Physics(0.002, 3, 0.002, 3)
+UNIFORM = Physics(0.002, 10, 0.002, 10)
 """One setting from start to end that both closes in small steps and does not creep, as a plain loop would have."""
 HAND = default_hand()
 Row = dict[str, np.ndarray]
@@ -54,7 +54,7 @@ def main() -> None:
     held = {name: row for name, row in rows.items() if len(row["waypoints"]) and row["working"].any()}
     firsts = {category(name): name for name in reversed(held)}.values()  # the first of each category
     timed = {name: held[name] for name in firsts}
-    result = summarise(rows) | speed(timed) | growth(timed) | {"profile": profile(timed)}
+    result = summarise(rows) | speed(timed) | growth(timed) | {"creep": creep(timed), "profile": profile(timed)}
     text = json.dumps(result, indent=2)
     if options.out:
         options.out.write_text(text + "\n")
@@ -233,6 +233,28 @@ def growth(rows: dict[str, Row]) -> dict[str, object]:
             trial.run(scene, many[first : first + size], HAND)
         cost[str(size)] = elapsed(start)[0] / len(many)
     return {"processor_seconds_per_trial_in_batches_of": cost}
+
+
+def creep(rows: dict[str, Row], seconds: float = 10.0) -> dict[str, object]:
+    """How far what is held slides in the hand when it is held for longer, at the working setting."""
+    slid = []
+    for name, row in rows.items():
+        scene, grasps = scene_of(name), Grasps(torch.tensor(row["waypoints"][row["working"]]), "world")
+        execution = Execution(scene, grasps, HAND, scene.model(HAND.spec), WORKING)
+        for time_reached in (LIFT_START, END):
+            execution.advance(execution.everyone, time_reached)
+        before = execution.in_palm(execution.everyone)
+        execution.advance(execution.everyone, END + seconds)
+        after = execution.in_palm(execution.everyone)
+        slid.append(1000 * np.linalg.norm((after - before)[:, :3], axis=1))
+    distances = np.concatenate(slid)
+    return {
+        "seconds": seconds,
+        "grasps": len(distances),
+        "median_mm": float(np.median(distances)),
+        "share_below_2_mm": float((distances < 2).mean()),
+        "farthest_mm": float(distances.max()),
+    }
 
 
 def profile(rows: dict[str, Row]) -> dict[str, float]:
