@@ -1,11 +1,12 @@
 """How far the labels can be trusted, and how fast they come.
 
 python benchmarks/simulator.py --out benchmarks/results/simulator.json
-Every `--every`-th object of each category is placed and seen; the generator's grasps and neighbours of those that hold
-are tried, and up to `--num_grasps` an object are kept, half of which hold where there are so many. Each is tried at the
-working and at the reference setting, and again with the wrist moved by 0.1, 1 and 3 mm (the reference by 1 and 3 mm on
-the first object of a category only). `--folder` keeps what is done, so that a run can be continued; then the clock is
-taken on the first object of each category where any holds, against plain loops over one MjData.
+Every `--every`-th object of each category is placed and seen; grasps of the first generator that finds any that hold,
+and neighbours of those, are tried, and up to `--num_grasps` an object are kept, half of which hold where there are so
+many. Each is tried at the working and at the reference setting, and again with the wrist moved by 0.1, 1 and 3 mm (the
+reference by 1 and 3 mm on the first object of a category only). `--folder` keeps what is done, so that a run can be
+continued; then the clock is taken on the first object of each category where any holds, against plain loops over one
+MjData.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import mujoco
 import numpy as np
 import torch
 
-from dexzoo.generators.heuristic import HeuristicGenerator
+from dexzoo.generators import make_generator
 from dexzoo.grasp import Grasps
 from dexzoo.hand import default_hand
 from dexzoo.sim import Scene, trial
@@ -32,6 +33,8 @@ OFFSETS = (0.0001, 0.001, 0.003)
 BATCHES = (1, 10, 100, 1000)
 UNIFORM = Physics(0.002, 10, 0.002, 10)
 """One setting from start to end that both closes in small steps and does not creep, as a plain loop would have."""
+COPIES = 4
+"""How often the working setting is timed on each grasp of an object, in one batch."""
 HAND = default_hand()
 Row = dict[str, np.ndarray]
 
@@ -40,6 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--every", type=int, default=4)
     parser.add_argument("--num_grasps", type=int, default=16)
+    parser.add_argument("--generators", nargs="+", default=["heuristic", "kopicki"])
     parser.add_argument("--folder", type=Path, default=Path("out/simulator"))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
@@ -48,7 +52,7 @@ def main() -> None:
     for name in names:
         path = options.folder / f"{name}.npz"
         if not path.exists():
-            np.savez(path, **measure(name, options.num_grasps, thorough=number(name) == 0))
+            np.savez(path, **measure(name, options.num_grasps, options.generators, thorough=number(name) == 0))
             sys.stderr.write(f"{name}\n")
     rows = {name: dict(np.load(options.folder / f"{name}.npz")) for name in names}
     held = {name: row for name, row in rows.items() if len(row["waypoints"]) and row["working"].any()}
@@ -73,14 +77,14 @@ def scene_of(name: str) -> Scene:
     return Scene.place(make_object(name), seed=0)
 
 
-def measure(name: str, num: int, thorough: bool) -> Row:
+def measure(name: str, num: int, generators: list[str], thorough: bool) -> Row:
     """Labels of one object's grasps under all settings; no grasps where it cannot be placed, seen or grasped."""
     try:
         scene = scene_of(name)
-        grasps = candidates(scene, num)
-    except (RuntimeError, ValueError) as error:
+        grasps = candidates(scene, num, generators)
+    except ValueError as error:
         sys.stderr.write(f"{error}\n")
-        return {"waypoints": np.zeros((0, 10, 28), np.float32)}
+        grasps = Grasps(torch.zeros(0, 10, 28), "world")
     out = {"waypoints": grasps.waypoints.numpy()}
     if not len(grasps):
         return out
@@ -97,25 +101,32 @@ def measure(name: str, num: int, thorough: bool) -> Row:
 
 
 def elapsed(start: tuple[float, float]) -> np.ndarray:
-    """Seconds of processor and of wall time."""
+    """Seconds of processor and of wall time since then."""
     return np.array([time.process_time() - start[0], time.perf_counter() - start[1]])
 
 
-def candidates(scene: Scene, num: int) -> Grasps:
-    """Grasps of which about half hold: generated ones, and neighbours at 1 cm of those that hold."""
+def candidates(scene: Scene, num: int, generators: list[str]) -> Grasps:
+    """Grasps of which about half hold: of the first generator with such, and neighbours at 1 cm of those that hold."""
     rng = np.random.default_rng(0)
     observation = scene.observe(seed=0)
-    grasps = HeuristicGenerator().generate(observation, 4 * num, seed=0).to_frame("world", scene.T_world_camera)
-    outcomes = trial.run(scene, grasps, HAND)
-    held = np.flatnonzero(outcomes.success)
-    if len(held):
-        near = moved(grasps[rng.choice(held, 2 * num)], 0.01, rng)
-        outcomes = trial.Outcomes.concatenate([outcomes, trial.run(scene, near, HAND)])
-        grasps = Grasps.concatenate([Grasps(grasps.waypoints, "world"), near])
+    for name in generators:
+        try:
+            generated = make_generator(name).generate(observation, 4 * num, seed=0)
+        except RuntimeError as error:
+            sys.stderr.write(f"{scene.object.name}, {name}: {error}\n")
+            continue
+        grasps = Grasps(generated.to_frame("world", scene.T_world_camera).waypoints, "world")
+        outcomes = trial.run(scene, grasps, HAND)
+        if outcomes.success.any():
+            break
+    else:
+        return Grasps(torch.zeros(0, 10, 28), "world")
+    near = moved(grasps[rng.choice(np.flatnonzero(outcomes.success), 2 * num)], 0.01, rng)
+    outcomes = trial.Outcomes.concatenate([outcomes, trial.run(scene, near, HAND)])
     tried = ~outcomes.collided & ~outcomes.starts_inside & ~outcomes.unstable
-    held, failed = np.flatnonzero(outcomes.success & tried), np.flatnonzero(~outcomes.success & tried)
-    held = rng.permutation(held)[: num // 2]
-    return grasps[np.sort(np.concatenate((held, rng.permutation(failed)[: num - num // 2])))]
+    held, failed = (np.flatnonzero(tried & (outcomes.success == holds)) for holds in (True, False))
+    chosen = np.concatenate((rng.permutation(held)[: num // 2], rng.permutation(failed)[: num - num // 2]))
+    return Grasps.concatenate([grasps, near])[np.sort(chosen)]
 
 
 def moved(grasps: Grasps, offset: float, rng: np.random.Generator) -> Grasps:
@@ -185,37 +196,41 @@ def summarise(rows: dict[str, Row]) -> dict[str, object]:
 
 
 def speed(rows: dict[str, Row]) -> dict[str, object]:
-    """Trials a second on all cores, and plain loops over the same grasps, in turns."""
-    seconds = {name: np.zeros(2) for name in ("working", "reference", "plain, same steps", "plain, uniform steps")}
-    labels: dict[str, list[np.ndarray]] = {name: [] for name in seconds}
+    """Trials a second on all cores, in batches as large as collection has them, and by plain loops."""
+    names = ("working", "reference", "plain, same steps", "plain, uniform steps")
+    processor, wall = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
+    same: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for name, row in rows.items():
         scene, grasps = scene_of(name), Grasps(torch.tensor(row["waypoints"]), "world")
+        many = grasps[np.tile(np.arange(len(grasps)), COPIES)]
         ways = (
-            lambda scene=scene, grasps=grasps: trial.run(scene, grasps, HAND).success,
+            lambda scene=scene, many=many: trial.run(scene, many, HAND).success,
             lambda scene=scene, grasps=grasps: trial.run(scene, grasps, HAND, physics=REFERENCE).success,
             lambda scene=scene, grasps=grasps: plain_loop(scene, grasps, WORKING),
             lambda scene=scene, grasps=grasps: plain_loop(scene, grasps, UNIFORM),
         )
-        for key, way in zip(seconds, ways, strict=True):
+        for key, way in zip(names, ways, strict=True):
             start = time.process_time(), time.perf_counter()
-            labels[key].append(way())
-            seconds[key] += elapsed(start)
-    together = {key: np.concatenate(parts) for key, parts in labels.items()}
-    count = len(together["working"])
+            held = way()
+            spent = elapsed(start) / (len(held) / len(grasps))
+            processor[key] += spent[0]
+            wall[key] += spent[1]
+            same[key].append(held == np.resize(row["working"], len(held)))
+    count = sum(len(row["waypoints"]) for row in rows.values())
     return {
         "timed": {
             "objects": len(rows),
             "grasps": count,
-            "hold": float(together["working"].mean()),
+            "hold": float(np.concatenate([row["working"] for row in rows.values()]).mean()),
             "threads": os.cpu_count(),
             "ways": {
-                key: {
-                    "trials_per_second": count / wall,
-                    "processor_seconds_per_trial": processor / count,
-                    "working_is_faster_by": wall / seconds["working"][1],
-                    "agrees_with_working": float((together[key] == together["working"]).mean()),
+                name: {
+                    "trials_per_second": count / wall[name],
+                    "processor_seconds_per_trial": processor[name] / count,
+                    "working_is_faster_by": wall[name] / wall["working"],
+                    "agrees_with_working": float(np.concatenate(same[name]).mean()),
                 }
-                for key, (processor, wall) in seconds.items()
+                for name in names
             },
         }
     }
