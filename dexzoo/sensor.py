@@ -1,7 +1,7 @@
 """The depth sensor: what a structured-light camera reads of a scene whose depth is known exactly.
 
-The figures are those of the simulator behind the thesis (a Kinect model after Gschwandtner et al., BlenSor, 2011, and
-Bohg et al. 2014), except where a constant says that it is ours, fitted to real frames by `benchmarks/sensor.py`.
+The figures are those of the simulator behind the thesis (the Kinect simulation of Bohg and of BlenSor), except where a
+constant says that it is ours, fitted to real frames by `benchmarks/sensor.py`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
 """The parametric objects: names and splits, sound meshes, convex parts that fit them, open cavities, rest."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -73,14 +75,15 @@ def test_objects_differ() -> None:
 
 
 def test_the_distance_of_surfaces_is_that_of_closed_forms() -> None:
-    """A cube of 60 mm against one 1.5 mm smaller on each side, and one with a gap; 0.3 mm is lost near edges."""
+    """A cube of 60 mm against one 1.5 mm smaller on each side, against its three slices, and against two of them."""
     box = trimesh.creation.box
     whole, small = box([0.06] * 3), box([0.057] * 3)
-    assert surface_distance(model_of(whole, [whole])) == pytest.approx(0, abs=3e-4)
+    assert surface_distance(model_of(whole, [whole])) == pytest.approx(0, abs=1e-9)
     assert surface_distance(model_of(whole, [small])) == pytest.approx(0.0015 * np.sqrt(3), rel=0.1)
     slabs = [box([0.02, 0.06, 0.06]).apply_translation([x, 0, 0]) for x in (-0.02, 0, 0.02)]
-    assert surface_distance(model_of(whole, slabs)) == pytest.approx(0, abs=3e-4), "cuts are no surface"
-    assert surface_distance(model_of(whole, [slabs[0], slabs[2]])) == pytest.approx(0.01, rel=0.1)
+    assert surface_distance(model_of(whole, slabs)) == pytest.approx(0, abs=1e-9), "cuts are no surface"
+    # the middles of the two faces at the gap are 20 mm from the cube's surface
+    assert surface_distance(model_of(whole, [slabs[0], slabs[2]])) == pytest.approx(0.02, rel=0.01)
 
 
 def model_of(mesh: trimesh.Trimesh, parts: list[trimesh.Trimesh]) -> ObjectModel:
@@ -126,7 +129,7 @@ def cavity(model: ObjectModel) -> tuple[np.ndarray, float, float]:
     hits = model.mesh.ray.intersects_location(rays, np.array([[0.0, 0, -1]]))[0]
     floor = hits[:, 2].max()
     assert floor < 0.65 * height, "a vessel is deep"
-    return axis, height - 1e-4, floor + 1e-3
+    return axis, height - 1e-4, floor + 2e-3  # within which the parts fit
 
 
 # they rest
@@ -134,7 +137,8 @@ def cavity(model: ObjectModel) -> tuple[np.ndarray, float, float]:
 
 @pytest.mark.parametrize("name", ["bottle_00", "cup_03", "mug_02", "shaker_03", "teapot_04", "jug_03", "pan_01"])
 def test_what_stands_stays_upright(name: str) -> None:
-    scene = Scene.place(make_object(name), seed=3)
+    on_the_table = replace(make_object(name), category="")  # cups would tumble, pans lie on a block
+    scene = Scene.place(on_the_table, seed=3)
     assert scene.T_world_object[2, 2] > np.cos(np.deg2rad(3))
 
 

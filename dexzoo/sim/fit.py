@@ -12,7 +12,7 @@ from dexzoo.sim.objects import ObjectModel
 Array = NDArray[np.float64]
 _PROBE = 1e-4  # m in front of a part's face: what lies in another part there is no surface of the whole
 _NEIGHBOURS = 8
-_REFERENCES = 24_000  # points to measure to: a triangle that none falls on is not measured to
+_REFERENCES = 24_000  # points to measure to: a triangle of a part that none falls on is not measured to
 
 
 def surface_distance(model: ObjectModel, num_points: int = 4000, seed: int = 0) -> float:
@@ -31,7 +31,8 @@ def surface_distance(model: ObjectModel, num_points: int = 4000, seed: int = 0) 
         touched_triangles.append(triangles[outside])
     skin, skin_triangles = np.concatenate(touched), np.concatenate(touched_triangles)
     few = np.random.default_rng(seed).permutation(min(len(skin), len(seen)))[:num_points]
-    return max(_farthest(skin[few], seen, seen_triangles), _farthest(seen[few], skin, skin_triangles))
+    to_mesh = _farthest(skin[few], seen, seen_triangles, model.mesh.triangles)
+    return max(to_mesh, _farthest(seen[few], skin, skin_triangles, np.unique(skin_triangles, axis=0)))
 
 
 def covered(model: ObjectModel, points: Array) -> NDArray[np.bool_]:
@@ -59,9 +60,22 @@ def _draw_ahead(part: trimesh.Trimesh, num: int, seed: int) -> tuple[Array, Arra
     return points, triangles, points + _PROBE * normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-def _farthest(points: Array, others: Array, triangles: Array) -> float:
-    """Largest distance of points (n, 3) from the nearest of the triangles that others, points on a surface, lie on."""
+def _farthest(points: Array, others: Array, triangles: Array, surface: Array) -> float:
+    """Largest distance of points (n, 3) from a surface, which others are drawn on; triangles are those they lie on."""
     _, near = cKDTree(others).query(points, k=_NEIGHBOURS)
     repeated = np.repeat(points, _NEIGHBOURS, axis=0)
-    closest = trimesh.triangles.closest_point(triangles[near.ravel()], repeated)
-    return float(np.linalg.norm(closest - repeated, axis=1).reshape(near.shape).min(1).max())
+    # the nearest triangle need not be among those of the nearest points, so these distances bound from above
+    bound = _distance(repeated, triangles[near.ravel()]).reshape(near.shape).min(1)
+    farthest = 0.0
+    for index in np.argsort(-bound):
+        if bound[index] <= farthest:
+            break
+        farthest = max(farthest, _distance(np.repeat(points[None, index], len(surface), axis=0), surface).min())
+    return farthest
+
+
+def _distance(points: Array, triangles: Array) -> Array:
+    """Distances of points (n, 3) from triangles (n, 3, 3), one from one."""
+    closest: Array = trimesh.triangles.closest_point(triangles, points)
+    distance: Array = np.linalg.norm(closest - points, axis=1)
+    return distance

@@ -26,7 +26,7 @@ class Physics:
     timestep: float = 0.002
     noslip_iterations: int = 0
     carry_timestep: float = 0.004
-    carry_noslip_iterations: int = 3
+    carry_noslip_iterations: int = 10
     stops_early: bool = True
 
 

@@ -43,8 +43,8 @@ def union(*solids: Solid) -> Solid:
 
 
 def hull(points: Array) -> Mesh:
-    """The convex hull of points (..., 3)."""
-    mesh: Mesh = trimesh.convex.convex_hull(points.reshape(-1, 3))
+    """The convex hull of points (..., 3), rounded to a nanometre: noise in what is flat can leave a facet out."""
+    mesh: Mesh = trimesh.convex.convex_hull(points.reshape(-1, 3).round(6))
     return mesh
 
 

@@ -108,7 +108,7 @@ def jug(rng: np.random.Generator, style: int) -> Solid:
     }.get(kind, (u(40, 44), u(125, 155)))
     side = {
         "measuring": [(0.82 * r, 0, 5), (r, h)],
-        "pitcher": [(0.84 * r, 0, 4), (1.02 * r, 0.38 * h, 14), (0.8 * r, h)],
+        "pitcher": [(0.84 * r, 0, 4), (r, 0.38 * h, 14), (0.8 * r, h)],
         "creamer": [(0.85 * r, 0, 4), (r, 0.42 * h, 15), (0.8 * r, h)],
         "water": [(r, 0, 5), (0.8 * r, h)],
     }[kind]
