@@ -42,6 +42,7 @@ Row = dict[str, np.ndarray]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--every", type=int, default=4)
+    parser.add_argument("--num_objects", type=int, help="only so many of them, the first of each category first")
     parser.add_argument("--num_grasps", type=int, default=16)
     parser.add_argument("--generators", nargs="+", default=["heuristic", "kopicki"])
     parser.add_argument("--folder", type=Path, default=Path("out/simulator"))
@@ -49,6 +50,7 @@ def main() -> None:
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     names = sorted((name for name in object_names() if number(name) % options.every == 0), key=number)
+    names = names[: options.num_objects]
     for name in names:
         path = options.folder / f"{name}.npz"
         if not path.exists():

@@ -260,6 +260,7 @@ def test_outcomes_depend_neither_on_threads_nor_on_batches(
     assert_equal(trial.run(can_scene, world_grasps[some], hand, num_threads), can_outcomes[some])
 
 
+@pytest.mark.slow
 def test_a_hundred_together_end_as_each_alone(can_scene: Scene, world_grasps: Grasps, some: np.ndarray) -> None:
     many = np.resize(some, 100)
     together = verify(world_grasps[many], can_scene)

@@ -17,8 +17,8 @@ from scipy.spatial import QhullError
 MIN_EXTENT, MAX_EXTENT = 5e-4, 1.0
 MIN_SLIVER = 2e-4
 MAX_FRICTION = 2.0
-PATIENCE = 300.0
-"""Seconds that CoACD may take for one mesh."""
+PATIENCE = 180.0
+"""Seconds that CoACD may take for one mesh; with holes or faces that cut each other it can be busy for ever."""
 _DECOMPOSE = Path(__file__).with_name("decompose.py")
 Mesh = trimesh.Trimesh
 
@@ -58,8 +58,8 @@ class ObjectModel:
         hulls: its convex parts, as files or meshes; None has them computed by CoACD (Wei et al. 2022), which takes
         seconds to a minute. Parts thinner than 0.2 mm, as decompositions leave them, are dropped.
         name: by default that of the file, or of its folder where the file is called mesh.
-        Unused vertices, faces that are double or of no area, and faces of a closed mesh that look inwards are mended;
-        holes and edges of more than two faces are left to CoACD.
+        Unused vertices, faces that are double or of no area, holes of three or four edges, and faces of a closed mesh
+        that look inwards are mended; larger holes and edges of more than two faces are left to CoACD.
         Raises FileNotFoundError or ValueError for a mesh that is missing, empty, flat, not finite, not in metres or
         too bad for CoACD.
         """
@@ -139,11 +139,13 @@ def _check(mesh: Mesh, where: str) -> None:
 
 
 def _mended(mesh: Mesh) -> Mesh:
-    """Without what no surface has, and its faces looking outwards where it is closed."""
+    """Without what no surface has, small holes filled, and its faces looking outwards where it is closed."""
     mesh = mesh.copy()
     mesh.merge_vertices()
     mesh.update_faces(mesh.unique_faces() & mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
+    if not mesh.is_watertight:
+        trimesh.repair.fill_holes(mesh)
     if mesh.is_watertight and (not mesh.is_winding_consistent or mesh.volume < 0):
         mesh.fix_normals()
     return mesh
