@@ -34,7 +34,8 @@ SPACING = 0.0015
 class Demonstration:
     """One grasp of a known object, and the surface near the hand at its grip, all in the object's frame.
 
-    object: its name. grasp: one Grasps whose "world" frame is the object's. surface: features near the hand at the grip.
+    object: its name. grasp: one Grasps whose "world" frame is the object's. surface: features near the hand at the
+    grip.
     """
 
     object: str
@@ -55,8 +56,8 @@ class Demonstration:
         near = np.asarray(distance < REACH)
         if near.sum() < MIN_POINTS or distance.min() > MAX_GAP:
             raise ValueError(
-                f"demonstration on {name}: the hand is {1000 * float(distance.min()):.0f} mm from the object at the grip; "
-                "give the grasp in the frame of the mesh, in metres"
+                f"demonstration on {name}: the hand is {1000 * float(distance.min()):.0f} mm from the object "
+                "at the grip; give the grasp in the frame of the mesh, in metres"
             )
         return cls(name, grasp, Features.of_surface(np.array(points), mesh.face_normals[faces], near))
 

@@ -197,7 +197,7 @@ class GraspDensity:
 
     @torch.no_grad()
     def neighbours(self, grips: Grips, num: int = 24) -> tuple[Tensor, Tensor, Tensor]:
-        """The kernels that matter near each grip: positions (n, l, num, 3), turns (n, l, num, 9), ln weights (n, l, num).
+        """The kernels that matter near each grip: positions (n, l, num, 3), turns (.., 9), ln weights (n, l, num).
 
         A kernel five bandwidths away weighs e^-25: so few are enough, and they serve as long as the grip stays near.
         """
@@ -218,7 +218,7 @@ class GraspDensity:
         return self.kernel_position[place], self.kernel_turn[place], self.log_weight[place]
 
     def log_density(self, grasps: Grasps) -> Float[Tensor, " grasp"]:
-        """ln of the likelihood of grasps in the frame of the surface (the world), by their grips; differentiable.
+        """Ln of the likelihood of grasps in the frame of the surface (the world), by their grips; differentiable.
 
         Where several demonstrations are of a grasp's type their likelihoods add up; where none is, it is -inf.
         """

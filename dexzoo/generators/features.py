@@ -114,7 +114,9 @@ class Features:
         terms = np.stack((u * u / 2, u * v, v * v / 2, u, v, np.ones_like(u)), -1)
         left = np.einsum("nk,nki,nkj->nij", weight, terms, terms) + 1e-3 * np.eye(6)
         right = np.einsum("nk,nki,nk->ni", weight, terms, h)
-        a, b, c = (np.linalg.solve(left, right[..., None])[..., 0] / -RADIUS)[:, :3].T
+        fitted = np.linalg.solve(left, right[..., None])[..., 0]
+        a, b, c = fitted[:, :3].T / -RADIUS
+        points = points + RADIUS * fitted[:, 5:] * normal  # on the fitted surface, without the sensor's noise
         half, root = (a + c) / 2, np.hypot((a - c) / 2, b)
         angle = 0.5 * np.arctan2(2 * b, a - c)
         first = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * y

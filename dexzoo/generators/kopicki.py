@@ -1,4 +1,4 @@
-"""Kopicki's one-shot generator: grasps of an unknown object from a few demonstrations (Kopicki et al. 2016; thesis, 3.1).
+"""Kopicki's one-shot generator: grasps of an unknown object from a few demonstrations (thesis, section 3.1).
 
 Grips are sampled from the product of experts of `density`, improved on it, and ranked by it less the cost of collisions
 on the way. Each carries its demonstration's approach and squeeze.
@@ -6,6 +6,7 @@ on the way. Each carries its demonstration's approach and squeeze.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -39,9 +40,10 @@ TABLE_COST = 1000.0
 class KopickiGenerator(GraspGenerator):
     """Grasps like those of the demonstrations.
 
-    demonstrations: what to learn from; the ten of the DLR/HIT hand II by default. num_per_type: most grasps of one type.
-    num_samples: grips drawn for each demonstration; num_kernels: of each link's query density. search: how samples are
-    improved, by simulated annealing as the original or by gradient.
+    demonstrations: what to learn from; the ten of the DLR/HIT hand II by default. num_per_type: most grasps of a type.
+    num_samples: grips drawn, num_kernels: kernels of a link's query density, over all demonstrations. search: how
+    samples are improved, by simulated annealing as in the original or by gradient; num_steps: before and after the best
+    are chosen. completes: whether the hidden side is guessed, see `Features.completed`.
     """
 
     def __init__(
@@ -96,7 +98,8 @@ class KopickiGenerator(GraspGenerator):
                 value = density.log_likelihood(grips) - way.cost(grips)
             if keep:
                 grips = best(grips, value, keep)
-        feasible = way.feasible(grips)
+        # what two links in contact weigh: with less, nothing is held between them
+        feasible = way.feasible(grips) & (value > 2 * math.log(1 / density.floor))
         if not feasible.any():
             raise RuntimeError("no feasible grasp is found: the object may be too large, too flat or out of reach")
         grasps = way.grasps(grips[feasible], value[feasible])
@@ -165,9 +168,13 @@ class Way:
         """The grips with their paths, in the world frame."""
         wrist, joints = self.keyframes(grips)
         return Grasps.from_keyframes(
-            wrist[..., :3, 3], rotation.from_matrix(wrist[..., :3, :3]), self.hand.expand(joints), self.types[grips.demo],
-            "world", log_likelihood,
-        )  # fmt: skip
+            wrist[..., :3, 3],
+            rotation.from_matrix(wrist[..., :3, :3]),
+            self.hand.expand(joints),
+            self.types[grips.demo],
+            "world",
+            log_likelihood,
+        )
 
     def _links(self, grips: Grips, at: Sequence[float]) -> Tensor:
         """(n, step, link, 4, 4) link poses on the way, at fractions of it from the pre-grasp to the grip.

@@ -1,0 +1,107 @@
+"""The Kopicki generator: feasible, alike for the same seed, and plain about what it cannot do."""
+
+import numpy as np
+import pytest
+import torch
+
+from dexzoo.camera import Camera, Observation, look_at
+from dexzoo.generators.demonstration import load_demonstrations
+from dexzoo.generators.density import Grips
+from dexzoo.generators.kopicki import KopickiGenerator, obstacles
+from dexzoo.generators.search import anneal, climb
+from dexzoo.grasp import GRIP, Grasps
+from dexzoo.hand import Hand
+from dexzoo.sim import Scene
+from dexzoo.sim.shapes import make_object
+
+CALL = {"num_samples": 600, "num_kernels": 4000, "num_steps": (5, 10)}
+
+
+@pytest.fixture(scope="module")
+def generator() -> KopickiGenerator:
+    shown = [one for one in load_demonstrations() if one.object in ("shaker_13", "box_09")]
+    return KopickiGenerator(shown, num_per_type=4, **CALL)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def grasps(generator: KopickiGenerator, can_view: Observation) -> Grasps:
+    return generator.generate(can_view, 20, seed=0)
+
+
+def test_the_likeliest_come_first_and_no_type_takes_all(grasps: Grasps, generator: KopickiGenerator) -> None:
+    assert grasps.frame == "camera"
+    assert grasps.log_likelihood is not None
+    assert (grasps.log_likelihood.diff() <= 0).all()
+    types, count = grasps.grasp_type.unique(return_counts=True)
+    assert count.max() <= 4
+    assert set(types.tolist()) <= {one.grasp_type for one in generator.demonstrations}
+    assert len(types) >= 3
+
+
+def test_grasps_keep_the_limits_and_clear_the_table(grasps: Grasps, can_view: Observation, hand: Hand) -> None:
+    hand.check(grasps.joints)
+    world = grasps.to_frame("world", can_view.T_world_camera)
+    way = world.wrist_pose[:, : GRIP + 1, None] @ hand.forward_kinematics(world.joints[:, : GRIP + 1])
+    assert hand.clearance(way, torch.tensor([0.0, 0, 1, 0])).min() > 0
+
+
+def test_the_hand_comes_to_the_object(grasps: Grasps, can_view: Observation, hand: Hand) -> None:
+    links = grasps.wrist_pose[:, GRIP, None] @ hand.forward_kinematics(grasps.joints[:, GRIP])
+    points = torch.from_numpy(can_view.points[::20])
+    nearest = hand.signed_distance(links, points).amin((-1, -2))
+    assert nearest.median() < 0.005
+    assert nearest.max() < 0.05, "what touches the hidden side is not far from the seen one"
+
+
+def test_the_same_seed_gives_the_same_grasps(
+    grasps: Grasps, generator: KopickiGenerator, can_view: Observation
+) -> None:
+    again = generator.generate(can_view, 20, seed=0)
+    assert torch.equal(again.waypoints, grasps.waypoints)
+    other = generator.generate(can_view, 20, seed=1)
+    assert not torch.equal(other.waypoints[: len(grasps)], grasps.waypoints[: len(other)])
+
+
+def test_annealing_and_gradient_both_raise_the_likelihood(generator: KopickiGenerator, can_view: Observation) -> None:
+    density = generator.density(can_view, seed=0)
+    grips = density.sample(40, torch.Generator().manual_seed(0))
+
+    def free(grips: Grips) -> torch.Tensor:
+        return torch.zeros(len(grips.demo))
+
+    before = density.log_likelihood(grips).mean()
+    annealed = anneal(density, grips, free, 60, torch.Generator().manual_seed(1))
+    climbed = climb(density, grips, free, 30)
+    assert density.log_likelihood(annealed).mean() > before + 1
+    assert density.log_likelihood(climbed).mean() > density.log_likelihood(annealed).mean(), "at half the steps"
+
+
+def test_the_likelihood_of_what_was_generated_is_that_of_the_density_less_costs(
+    grasps: Grasps, generator: KopickiGenerator, can_view: Observation
+) -> None:
+    density = generator.density(can_view, seed=0)
+    value = density.log_density(grasps.to_frame("world", can_view.T_world_camera))
+    assert grasps.log_likelihood is not None
+    assert (value >= grasps.log_likelihood - 0.5).all()
+
+
+def test_the_support_of_an_object_is_an_obstacle() -> None:
+    scene = Scene.place(make_object("scissors_02"), seed=0)
+    seen = obstacles(scene.observe(seed=1, ideal=True))
+    assert scene.support is not None
+    assert len(seen) > 5
+    local = seen @ torch.tensor(scene.support.pose[:3, :3], dtype=torch.float32)
+    assert (local[:, :2].abs() < torch.tensor(scene.support.half[:2]) + 0.015).all()
+
+
+def test_what_cannot_be_grasped_is_said(generator: KopickiGenerator, can_view: Observation) -> None:
+    with pytest.raises(ValueError, match="num_grasps is 0"):
+        generator.generate(can_view, 0)
+    # a slab as large as the table that hides everything below it
+    camera = Camera(320, 240, 287.0, 287.0, 160.0, 120.0)
+    pose = look_at(np.array([0.0, 0.0, 0.0]), 0.6, 0.3, 1.5)
+    down = camera.directions() @ pose[:3, :3].T
+    depth = (0.02 - pose[2, 3]) / down[..., 2]
+    slab = Observation(depth, camera, pose, mask=np.ones((240, 320), bool))
+    with pytest.raises(RuntimeError, match="no feasible grasp"):
+        generator.generate(slab, 10)
