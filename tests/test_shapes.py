@@ -10,6 +10,9 @@ from dexzoo.sim import ObjectModel, Scene
 from dexzoo.sim.fit import covered, surface_distance
 from dexzoo.sim.shapes import MASS_RANGE, NUM_OBJECTS, make_object, object_names, split_of
 
+# in one worker, which makes all objects once
+pytestmark = pytest.mark.xdist_group("shapes")
+
 SPLITS = {"train": 220, "validation": 30, "test": 44}
 
 
