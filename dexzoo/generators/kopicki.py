@@ -32,6 +32,8 @@ MAX_REACH = 0.24
 """Metres that the wrist may be from the nearest observed point at the pre-grasp; the stand-off is shortened for it."""
 COLLISION_STEPS, COLLISION_WEIGHTS = (0.0, 0.4, 0.7, 0.9), (1.0, 1.0, 0.5, 0.2)
 """Where on the way from the pre-grasp (0) to the grip (1) collisions are looked at, and how much they count."""
+JOINT_BANDWIDTH = 0.1
+"""Radians; wider than Kopicki's, so that each finger adapts to the surface by itself."""
 NUM_POINTS = 300
 TABLE_COST = 1000.0
 """Log-likelihood that a metre below the least clearance costs."""
@@ -62,7 +64,7 @@ class KopickiGenerator(GraspGenerator):
         share = len(self.demonstrations)
         self.num_per_type = num_per_type
         self.num_samples, self.num_kernels = max(num_samples // share, 50), max(num_kernels // share, 500)
-        self.widths, self.search, self.num_steps = widths or Bandwidths(), search, num_steps
+        self.widths, self.search, self.num_steps = widths or Bandwidths(joint=JOINT_BANDWIDTH), search, num_steps
         self.completes = completes
         self.models = [contact_models(d, self.hand, self.widths) for d in self.demonstrations]
 
