@@ -1,8 +1,8 @@
 """Autonomous training: let the Kopicki generator practise on training objects, and keep what held as demonstrations.
 
 python benchmarks/practice.py --out out/practised --num_objects 60
-Objects whose demonstrations are there already are passed over, so that a run can be continued. At the end, `--out` holds
-the shipped demonstrations and those that differ from them and from each other.
+Objects that were practised on already are passed over, so that a run can be continued. At the end, `--out` holds the
+shipped demonstrations and those that differ from them and from each other.
 """
 
 import argparse
