@@ -212,8 +212,7 @@ def labels(found: dict[str, Any]) -> str:
             "itself when the wrist is moved is the ceiling of any evaluator's accuracy:\n",
             table(("moved by", *curves["working"]), moved),
             f"{timed['grasps']} grasps of {timed['objects']} objects, {percent(timed['hold'])} of which hold, on "
-            f"{timed['threads']} threads (the plain loops on one), while other jobs shared the processor, which lowers "
-            "the rates and the gain by threads but not the processor time:\n",
+            f"{timed['threads']} threads (the plain loops on one):\n",
             table(
                 (
                     "trials of the same grasps",
