@@ -9,7 +9,8 @@ import trimesh
 
 from dexzoo import planning
 from dexzoo.camera import Camera, Observation, look_at
-from dexzoo.generators.heuristic import HeuristicGenerator, complete, spread
+from dexzoo.generators.generator import spread
+from dexzoo.generators.heuristic import HeuristicGenerator, complete
 from dexzoo.grasp import GRASP_TYPES, GRIP, PREGRASP, SQUEEZE, Grasps
 from dexzoo.hand import Hand
 from dexzoo.sim import ObjectModel, Outcomes, Scene

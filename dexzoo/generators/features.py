@@ -22,7 +22,8 @@ OUTLIER_RADIUS, OUTLIER_NEIGHBOURS = 0.005, 5
 """A point with fewer others this near is taken for noise."""
 MAX_FLATNESS = 0.1
 """Least over greatest spread of a neighbourhood beyond which it is no surface."""
-_NUM_NEIGHBOURS = 48
+_NUM_NEIGHBOURS = 144
+_MAX_POINTS = 6000
 
 
 @dataclass(frozen=True)
@@ -90,15 +91,15 @@ class Features:
         outward: (n, 3) directions on the outer side of each point.
         """
         # neighbours spread over the whole radius: the nearest ones alone would fit the sensor's noise
-        thinned = cloud if len(cloud) <= 6000 else cloud[:: len(cloud) // 6000 + 1]
-        facing = normals if normals is None or len(cloud) <= 6000 else normals[:: len(cloud) // 6000 + 1]
+        every = len(cloud) // _MAX_POINTS + 1 if len(cloud) > _MAX_POINTS else 1
+        thinned = cloud[::every]
         distance, index = cKDTree(thinned).query(
-            points, k=min(_NUM_NEIGHBOURS * 3, len(thinned)), distance_upper_bound=RADIUS, workers=-1
+            points, k=min(_NUM_NEIGHBOURS, len(thinned)), distance_upper_bound=RADIUS, workers=-1
         )
         weight = np.isfinite(distance).astype(np.float64)
         index = np.minimum(index, len(thinned) - 1)
-        if facing is not None:
-            weight *= np.einsum("nki,ni->nk", facing[index], outward) > 0.3
+        if normals is not None:
+            weight *= np.einsum("nki,ni->nk", normals[::every][index], outward) > 0.3
         offset = thinned[index] - points[:, None]
         total = np.maximum(weight.sum(1, keepdims=True), 1)
         mean = np.einsum("nk,nki->ni", weight, offset) / total

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dexzoo import rotation
 from dexzoo.camera import Observation
-from dexzoo.generators.generator import GraspGenerator
+from dexzoo.generators.generator import MAX_REACH, MIN_CLEARANCE, GraspGenerator, spread
 from dexzoo.grasp import GRASP_TYPES, Grasps, pose_matrix
 from dexzoo.hand import Hand, default_hand
 from dexzoo.segmentation import MIN_POINTS
@@ -25,10 +25,7 @@ from dexzoo.segmentation import MIN_POINTS
 MAX_WIDTH = 0.085
 """Widest thing in metres that fits between open thumb and fingers."""
 MAX_PENETRATION = 0.002
-MIN_CLEARANCE = 0.002
 STANDOFF = 0.09
-MAX_REACH = 0.24
-"""Metres that the wrist may be from the nearest observed point at the pre-grasp; the stand-off is shortened for it."""
 SQUEEZE = 0.35
 """Radians that mcp and pip go on from the grip to the squeeze."""
 _LEVELS = 12
@@ -278,24 +275,6 @@ def complete(observation: Observation, rng: np.random.Generator) -> tuple[NDArra
         np.concatenate((cloud, turned[hidden])).astype(np.float32),
         np.concatenate((normals, turned_normals[hidden])).astype(np.float32),
     )
-
-
-def spread(grasps: Grasps, score: Tensor, num: int) -> Tensor:
-    """Indices of `num` grasps, best first, passing over those within 1 cm and 0.2 rad of a better one."""
-    order = score.argsort(descending=True, stable=True)
-    grip = grasps.waypoints[:, 6]
-    chosen: list[int] = []
-    for index in order.tolist():
-        if len(chosen) == num:
-            break
-        if chosen:
-            near = (grip[chosen, :3] - grip[index, :3]).norm(dim=-1) < 0.01
-            near &= (grip[chosen, 3:7] * grip[index, 3:7]).sum(-1).abs() > np.cos(0.1)
-            near &= grip[chosen, 27] == grip[index, 27]
-            if near.any():
-                continue
-        chosen.append(index)
-    return torch.tensor(chosen)
 
 
 def _extent(

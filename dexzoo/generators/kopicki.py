@@ -19,17 +19,13 @@ from dexzoo.camera import Observation
 from dexzoo.generators.demonstration import Demonstration, load_demonstrations
 from dexzoo.generators.density import Bandwidths, GraspDensity, Grips, contact_models
 from dexzoo.generators.features import Features
-from dexzoo.generators.generator import GraspGenerator
+from dexzoo.generators.generator import MAX_REACH, MIN_CLEARANCE, GraspGenerator, spread
 from dexzoo.generators.search import anneal, climb
-from dexzoo.grasp import GRIP, NUM_TYPES, PREGRASP, SQUEEZE, Grasps, pose_matrix
+from dexzoo.grasp import GRIP, PREGRASP, SQUEEZE, Grasps, pose_matrix
 from dexzoo.hand import Hand, default_hand
 from dexzoo.segmentation import MAX_DEPTH, MIN_HEIGHT
 
 NUM_FEATURES = 1000
-MIN_CLEARANCE = 0.002
-"""Metres that every link keeps from the table up to the grip."""
-MAX_REACH = 0.24
-"""Metres that the wrist may be from the nearest observed point at the pre-grasp; the stand-off is shortened for it."""
 COLLISION_STEPS, COLLISION_WEIGHTS = (0.0, 0.4, 0.7, 0.9), (1.0, 1.0, 0.5, 0.2)
 """Where on the way from the pre-grasp (0) to the grip (1) collisions are looked at, and how much they count."""
 JOINT_BANDWIDTH = 0.1
@@ -105,7 +101,7 @@ class KopickiGenerator(GraspGenerator):
         if not feasible.any():
             raise RuntimeError("no feasible grasp is found: the object may be too large, too flat or out of reach")
         grasps = way.grasps(grips[feasible], value[feasible])
-        chosen = spread(grasps, self.num_per_type, num_grasps)
+        chosen = spread(grasps, value[feasible], num_grasps, self.num_per_type)
         return grasps[chosen].to_frame("camera", observation.T_world_camera)
 
 
@@ -136,15 +132,8 @@ class Way:
         back = wrist[:, 0, :3, 3] - grips.wrist[:, :3, 3]
         length = back.norm(dim=-1).clamp_min(1e-6)
         share = ((MAX_REACH - far) / length).clamp(0, 1)
-        start = torch.cat(
-            (
-                wrist[:, 0, :, :3],
-                torch.cat((grips.wrist[:, :3, 3] + share[:, None] * back, torch.ones_like(share)[:, None]), -1)[
-                    ..., None
-                ],
-            ),
-            -1,
-        )
+        start = wrist[:, 0].clone()
+        start[:, :3, 3] = grips.wrist[:, :3, 3] + share[:, None] * back
         shown = self.joints[grips.demo]
         joints = torch.stack((shown[:, 0], grips.joints, self.hand.clamp(grips.joints + shown[:, 2] - shown[:, 1])), 1)
         return torch.cat((start[:, None], wrist[:, 1:]), 1), joints
@@ -179,10 +168,7 @@ class Way:
         )
 
     def _links(self, grips: Grips, at: Sequence[float]) -> Tensor:
-        """(n, step, link, 4, 4) link poses on the way, at fractions of it from the pre-grasp to the grip.
-
-        The wrist does not turn on the way, so that its pose is the grip's but for the place.
-        """
+        """(n, step, link, 4, 4) link poses on the way, at fractions of it from the pre-grasp to the grip."""
         wrist, joints = self.keyframes(grips)
         t = wrist.new_tensor(at)[:, None]
         place = torch.lerp(wrist[:, :1, :3, 3], wrist[:, 1:2, :3, 3], t)
@@ -221,20 +207,3 @@ def best(grips: Grips, value: Tensor, num: int) -> Grips:
         rows = (grips.demo == demo).nonzero().squeeze(-1)
         parts.append(rows[value[rows].topk(min(num, len(rows))).indices])
     return grips[torch.cat(parts)]
-
-
-def spread(grasps: Grasps, num_per_type: int, num: int) -> Tensor:
-    """Indices of the likeliest, passing over those within 1 cm and 0.2 rad of a better one of the type."""
-    assert grasps.log_likelihood is not None
-    grip, taken, chosen = grasps.waypoints[:, GRIP], torch.zeros(NUM_TYPES, dtype=torch.long), list[int]()
-    for index in grasps.log_likelihood.argsort(descending=True, stable=True).tolist():
-        kind = int(grip[index, 27])
-        if taken[kind] >= num_per_type or len(chosen) == num:
-            continue
-        near = (grip[chosen, :3] - grip[index, :3]).norm(dim=-1) < 0.01
-        near &= (grip[chosen, 3:7] * grip[index, 3:7]).sum(-1).abs() > np.cos(0.1)
-        near &= grip[chosen, 27] == kind
-        if not near.any():
-            chosen.append(index)
-            taken[kind] += 1
-    return torch.tensor(chosen)

@@ -67,8 +67,7 @@ def anneal(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int, gene
         turn = vonmises_fisher([1.0, 0, 0, 0], TURN_CONCENTRATION).rvs(count, random_state=rng)
         turn = rotation.exp(heat * rotation.log(rotation.normalize(torch.tensor(turn, dtype=torch.float32))))
         wrist = grips.wrist @ pose_matrix(torch.zeros(count, 3), turn)
-        wrist = torch.cat((wrist[:, :3, :3], wrist[:, :3, 3:] + shift[..., None]), -1)
-        wrist = torch.cat((wrist, grips.wrist[:, 3:]), -2)
+        wrist[:, :3, 3] += shift
         joints = density.hand.clamp(
             grips.joints + heat * JOINT_STEP * torch.randn(grips.joints.shape, generator=generator)
         )
