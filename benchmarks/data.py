@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import torch
 
-from dexzoo.data.collect import FRICTION_RANGE, NEIGHBOUR_RATIO, SCALE_RANGE
+from dexzoo.data.collect import NEIGHBOUR_RATIO, SCALE_RANGE
 from dexzoo.data.grasp_set import GraspSet
 from dexzoo.data.rendering import rebuild
 from dexzoo.data.schema import SPLITS
@@ -26,6 +26,7 @@ from dexzoo.grasp import GRASP_TYPES, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.sim import trial
 from dexzoo.sim.world import REFERENCE, WORKING
+from dexzoo.verification import FRICTION
 
 RANKS = (0, 1, 5, 10, 25, 50, 100)
 GRASPS_A_SCENE = 5
@@ -71,7 +72,7 @@ def count(data: GraspSet, manifest: dict) -> dict[str, object]:
     return {
         "configuration": manifest["configuration"],
         "scale": SCALE_RANGE,
-        "friction": FRICTION_RANGE,
+        "friction": FRICTION,
         "neighbours_per_generated": NEIGHBOUR_RATIO,
         "grasps": len(data.success),
         "scenes": data.scenes.num_rows,

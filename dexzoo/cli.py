@@ -23,14 +23,13 @@ from dexzoo.data.collect import ALL, Configuration, collect
 from dexzoo.data.schema import SPLITS
 from dexzoo.data.writer import MANIFEST, read_manifest
 from dexzoo.generators import list_generators
-from dexzoo.generators.demonstration import Demonstration
+from dexzoo.generators.demonstration import SHIPPED, Demonstration
 from dexzoo.generators.preshape import close, read_preshapes, read_recording
 from dexzoo.grasp import GRASP_TYPES, GRIP, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.models.zoo import list_models, model_class, shipped_card
 from dexzoo.planning import Plan, plan
 from dexzoo.refinement import refine
-from dexzoo.resources import resource
 from dexzoo.sim import ObjectModel, Scene
 from dexzoo.sim.shapes import make_object
 from dexzoo.verification import verify
@@ -316,7 +315,7 @@ def _demonstrate(options: Namespace) -> Result:
         obj = ObjectModel.from_mesh(options.mesh)
         shown = [(obj, read_recording(options.recording, hand))]
     else:
-        preshapes = options.preshapes or resource("robots") / "dlr2" / "demonstrations" / "preshapes.yaml"
+        preshapes = options.preshapes or SHIPPED / "preshapes.yaml"
         shown = []
         for preshape in read_preshapes(preshapes, hand):
             obj = make_object(preshape.object)

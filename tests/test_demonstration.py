@@ -8,17 +8,16 @@ import pytest
 import torch
 import trimesh
 
-from dexzoo.generators.demonstration import Demonstration, distinct, load_demonstrations
+from dexzoo.generators.demonstration import SHIPPED, Demonstration, distinct, load_demonstrations
 from dexzoo.generators.preshape import SQUEEZE, close, read_preshapes, read_recording
 from dexzoo.grasp import GRASP_TYPES, GRIP, PREGRASP
 from dexzoo.grasp import SQUEEZE as SQUEEZE_WAYPOINT
 from dexzoo.hand import Hand
-from dexzoo.resources import resource
 from dexzoo.sim import Scene
 from dexzoo.sim.shapes import make_object, split_of
 from dexzoo.verification import verify
 
-PRESHAPES = resource("robots") / "dlr2" / "demonstrations" / "preshapes.yaml"
+PRESHAPES = SHIPPED / "preshapes.yaml"
 
 
 def test_ten_types_are_shown_on_six_training_objects() -> None:

@@ -31,7 +31,7 @@ MIN_GENERATED = 10
 """A scene with fewer generated grasps is skipped, and so is one where none of them holds (thesis, section 3.2)."""
 NEIGHBOUR_RATIO = 0.6
 """Simulated neighbours for each generated grasp."""
-SCALE_RANGE, FRICTION_RANGE = (0.95, 1.05), (0.5, 1.0)
+SCALE_RANGE = (0.95, 1.05)
 VIEW_TRIES = 3
 ALL = "all"
 TEST_EVERY = 6
@@ -95,7 +95,7 @@ def make_scene(configuration: Configuration, number: int) -> SceneRows:
     name = object_of(number, configuration.split)
     obj = make_object(name)
     scale = float(rng.uniform(*SCALE_RANGE))
-    mass, friction = float(rng.uniform(*MASS_RANGE[obj.category])), float(rng.uniform(*FRICTION_RANGE))
+    mass, friction = float(rng.uniform(*MASS_RANGE[obj.category])), float(rng.uniform(*verification.FRICTION))
     obj = replace(obj.scaled(scale), mass=mass, friction=friction)
     row: dict[str, Any] = {
         "scene": number,

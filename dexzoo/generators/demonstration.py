@@ -21,6 +21,8 @@ from dexzoo.hand import Hand
 from dexzoo.resources import resource
 from dexzoo.segmentation import MIN_POINTS
 
+SHIPPED = resource("robots") / "dlr2" / "demonstrations"
+"""The ten demonstrations of the DLR/HIT hand II, and preshapes.yaml, which they are made of."""
 REACH = 0.012
 """Metres from the hand within which the surface is kept; the contact models' receptive field is smaller."""
 MAX_SURFACE_DIFFERENCE, MAX_JOINT_DIFFERENCE = 0.006, 0.15
@@ -100,7 +102,7 @@ class Demonstration:
 @lru_cache(maxsize=4)
 def load_demonstrations(folder: str = "") -> tuple[Demonstration, ...]:
     """The demonstrations of a folder, by name of the file; those of the DLR/HIT hand II by default."""
-    where = Path(folder) if folder else resource("robots") / "dlr2" / "demonstrations"
+    where = Path(folder) if folder else SHIPPED
     paths = sorted(where.glob("*.safetensors"))
     if not paths:
         raise FileNotFoundError(f"folder {where} holds no demonstration; make some with python -m dexzoo demonstrate")
