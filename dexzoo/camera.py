@@ -19,6 +19,8 @@ from dexzoo import rotation
 from dexzoo.segmentation import fit_table, segment
 
 IMAGE_SIZE = 224
+MAX_TILT, MAX_RISE = np.deg2rad(10), 0.05
+"""Radians and metres by which a camera's pose may contradict the table that it sees."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,8 @@ class Observation:
     T_world_camera: (4, 4) pose of the camera in the world, whose table top is z = 0. Without it, the world is laid
     into the table: z up, origin below the camera, x along the camera's.
     table: (4,) plane in the camera frame, normal . p + offset = height over the table. Without it, it follows from
-    T_world_camera, or is fitted to the image; given with it, it tells heights, while the pose tells where grasps are.
+    T_world_camera, or is fitted to the image. Given with it, the pose is levelled: the table that is seen tells height
+    and tilt of a camera better than its calibration.
     mask: (height, width) bool, the object's pixels. Without it, the object is segmented.
 
     Raises ValueError that says what is wrong with the image or that no object is seen.
@@ -128,8 +131,9 @@ class Observation:
         self.T_world_camera: NDArray[np.float64]
         self.table: NDArray[np.float64]
         if T_world_camera is not None:
-            self.T_world_camera = rotation.check_pose(T_world_camera, "T_world_camera").numpy()
-            self.table = self.T_world_camera[2].copy() if table is None else _check_table(table)
+            pose = rotation.check_pose(T_world_camera, "T_world_camera").numpy()
+            self.table = pose[2].copy() if table is None else _check_table(table)
+            self.T_world_camera = pose if table is None else _level(pose, self.table)
         else:
             self.table = fit_table(self._cloud[self.depth > 0]) if table is None else _check_table(table)
             self.T_world_camera = _pose_over_table(self.table)
@@ -291,6 +295,31 @@ def _check_table(table: NDArray[Any]) -> NDArray[np.float64]:
     if plane[3] <= 0:
         raise ValueError("table plane lies above the camera: normal . p + offset must be a height over the table")
     return np.asarray(plane / np.linalg.norm(plane[:3]))
+
+
+def _level(pose: NDArray[np.float64], table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """T_world_camera turned and raised by the least that lays the table into z = 0."""
+    up = pose[:3, :3] @ table[:3]
+    tilt, rise = np.arccos(min(up[2], 1.0)), table[3] - pose[2, 3]
+    if tilt > MAX_TILT or abs(rise) > MAX_RISE:
+        raise ValueError(
+            f"T_world_camera and the table plane contradict each other by {np.rad2deg(tilt):.1f} degrees and "
+            f"{1000 * rise:.0f} mm; give the pose in a world whose table top is z = 0, or leave one of them out"
+        )
+    if tilt < 1e-6 and abs(rise) < 1e-9:
+        return pose  # to the bit
+    levelled = pose.copy()
+    levelled[:3, :3] = _turn_between(up, np.array([0, 0, 1.0])) @ pose[:3, :3]
+    levelled[2, 3] = table[3]
+    return levelled
+
+
+def _turn_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) least rotation that takes unit vector a to b, which must not be opposite."""
+    axis = np.cross(a, b)
+    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turn: NDArray[np.float64] = np.eye(3) + K + K @ K / (1 + a @ b)
+    return turn
 
 
 def _pose_over_table(plane: NDArray[np.float64]) -> NDArray[np.float64]:

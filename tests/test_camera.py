@@ -13,6 +13,7 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from dexzoo import rotation
 from dexzoo.camera import Camera, Observation, colourise
 from dexzoo.segmentation import fit_table
 
@@ -130,6 +131,28 @@ def test_table_of_a_camera_on_its_side() -> None:
     T = Observation(np.full((480, 640), 0.5), CAMERA, table=plane).T_world_camera
     np.testing.assert_allclose(T[:3, :3] @ [1, 0, 0], [0, 0, 1], atol=1e-9)
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+
+
+def test_a_pose_is_levelled_by_the_table_that_is_seen() -> None:
+    truth = Observation(np.full((480, 640), 0.5), CAMERA, T_WORLD_CAMERA)
+    off = T_WORLD_CAMERA.copy()
+    tilt = rotation.to_matrix(rotation.exp(torch.tensor([0.02, -0.03, 0.0], dtype=torch.float64))).numpy()
+    off[:3, :3] = tilt @ off[:3, :3]
+    off[2, 3] += 0.01
+    levelled = Observation(truth.depth, CAMERA, off, truth.table)
+    np.testing.assert_allclose(levelled.T_world_camera[2], truth.table, atol=1e-9)
+    np.testing.assert_allclose(levelled.T_world_camera, T_WORLD_CAMERA, atol=2e-3)
+    np.testing.assert_allclose(levelled.table, truth.table, atol=1e-12)
+
+
+@pytest.mark.parametrize(("rise", "tilt", "says"), [(0.1, 0.0, "-100 mm"), (0.0, 0.3, "17.2 degrees")])
+def test_a_pose_that_contradicts_the_table(rise: float, tilt: float, says: str) -> None:
+    pose = T_WORLD_CAMERA.copy()
+    turn = rotation.to_matrix(rotation.exp(torch.tensor([tilt, 0, 0], dtype=torch.float64))).numpy()
+    pose[:3, :3] = turn @ pose[:3, :3]
+    pose[2, 3] += rise
+    with pytest.raises(ValueError, match=f"contradict each other by .*{says}"):
+        Observation(np.full((480, 640), 0.5), CAMERA, pose, T_WORLD_CAMERA[2])
 
 
 def test_table_plane_need_not_be_normalised() -> None:

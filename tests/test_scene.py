@@ -254,7 +254,7 @@ def test_ideal_points_lie_on_the_object_and_noisy_ones_near_it(can_scene: Scene,
         return trimesh.proximity.closest_point(mesh, points[chosen])[1]
 
     ideal = replace(can_scene).observe(seed=1, ideal=True)
-    np.testing.assert_array_equal(ideal.T_world_camera, can_view.T_world_camera)
+    assert np.abs(ideal.T_world_camera - can_view.T_world_camera)[:, :3].max() < 1e-12
     assert distance(ideal.points_world).max() < 1e-4
 
 
@@ -266,7 +266,8 @@ def test_the_camera_stands_a_little_off_and_the_table_is_where_it_is_seen(can_sc
     off = []
     for seed in range(100):
         observation = scene.observe(seed, SMALL, pose)
-        np.testing.assert_array_equal(observation.T_world_camera, pose)
+        np.testing.assert_allclose(observation.T_world_camera[:2], pose[:2], atol=1e-12)
+        np.testing.assert_allclose(observation.T_world_camera[2], observation.table, atol=1e-12)
         np.testing.assert_allclose(observation.table[:3], pose[2, :3], atol=1e-12)
         off.append(observation.table[3] - pose[2, 3])
         if seed < 10:  # what lies far from the object is table
@@ -276,7 +277,7 @@ def test_the_camera_stands_a_little_off_and_the_table_is_where_it_is_seen(can_sc
 
 
 def test_points_are_off_by_as_much_as_the_camera(can_scene: Scene) -> None:
-    """The middle of the can's top, seen from one place, is seen 4 mm off on each axis."""
+    """The middle of the can's top, seen from one place, is seen 4 mm off along the table, at its true height."""
     pose = look_at(np.array([0.0, 0, 0.05]), 0.5, 1.0, 0.8)
     scene = replace(can_scene)
 
@@ -288,8 +289,9 @@ def test_points_are_off_by_as_much_as_the_camera(can_scene: Scene) -> None:
     moved = [top(scene.observe(seed, T_world_camera=pose)) for seed in range(30)]
     assert np.abs(np.mean(moved, axis=0) - top(scene.observe(T_world_camera=pose, ideal=True))).max() < 0.003
     spread = np.std(moved, axis=0)
-    assert (spread > 0.0025).all()
-    assert (spread < 0.0065).all()
+    assert (spread[:2] > 0.0025).all()
+    assert (spread[:2] < 0.0065).all()
+    assert spread[2] < 0.0015
 
 
 def test_ideal_depth_of_a_box_is_exact() -> None:

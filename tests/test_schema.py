@@ -90,6 +90,6 @@ def test_depth_is_that_of_the_object_alone() -> None:
     depth = np.full((224, 224), 0.5, np.float32)
     mask = np.zeros((224, 224), bool)
     mask[100:120, 90:130] = True
-    png = encode_depth(Observation(depth, Camera.aimed(), np.eye(4), np.array([0, 0, -1, 0.6]), mask))
+    png = encode_depth(Observation(depth, Camera.aimed(), table=np.array([0, 0, -1, 0.6]), mask=mask))
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(image, np.where(mask, 5000, 0))

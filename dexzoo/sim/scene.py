@@ -72,8 +72,8 @@ class Scene:
         3 cm of the object's centre. ideal: exact depth instead of the sensor's, from exactly this pose.
 
         Otherwise the camera really stands N(0, 4 mm) beside this pose on each axis, as one whose calibration is off:
-        the observation, and so the grasps that come of it, are off against the scene by that much. The table
-        is where the image shows it, since who looks at a table can fit it.
+        the observation, and so the grasps that come of it, are off against the scene by that much along the table.
+        Its height over the table is that in the image, since who looks at a table can fit it.
         An object on a block is told from it by the rays; on real images such a mask must be given. On the table the
         object is segmented as on real images.
         Raises ValueError when the object cannot be seen from there.
@@ -96,7 +96,7 @@ class Scene:
             seen = read_depth(depth, lit, camera, rng)
         mask = None if self.support is None else on_object
         observation = Observation(seen, camera, pose, true[2], mask)
-        self.T_world_camera = pose
+        self.T_world_camera = observation.T_world_camera
         return observation
 
     def _center(self) -> NDArray[np.float64]:
