@@ -22,7 +22,7 @@ from unittest.mock import patch
 import generator_pictures
 import numpy as np
 import torch
-from generator_figures import FLAGS, TOP, Trials, compared
+from generator_figures import COSTS, FLAGS, TOP, Trials, compared
 from torch import Tensor
 
 from dexzoo import verification
@@ -35,7 +35,7 @@ from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.generators.kopicki import KopickiGenerator, Way
 from dexzoo.grasp import GRIP, NUM_TYPES, Grasps
 from dexzoo.hand import default_hand
-from dexzoo.sim import ObjectModel, Outcomes, Scene, trial
+from dexzoo.sim import ObjectModel, Scene, trial
 from dexzoo.sim.shapes import MASS_RANGE, make_object
 
 TRIES = 5
@@ -46,6 +46,8 @@ ORIGINAL_STEPS = (50, 450)
 """Kopicki's steps of annealing before and after the best are chosen."""
 KERNELS, SAMPLES = (5_000, 15_000, 50_000, 150_000), (1_000, 3_000, 10_000, 30_000)
 NUM_GROWTH = 3
+FORGET_PEAK = Path("/proc/self/clear_refs")
+"""Where Linux is told to count the most memory held anew."""
 Setting = Callable[[int], tuple[Scene, Observation, int, int]]
 """A scene by its number, a view of it, the generator's seed, and how many scenes were drawn in vain before."""
 
@@ -120,8 +122,13 @@ def main() -> None:
         if not options.done:
             run({name: known[name] for name in options.variants}, setting, folder, options.scenes, options.num_grasps)
         done = {name: load(folder / name, options.scenes) for name in options.variants}
-        result = {"split": "meshes" if options.meshes else options.split, "num_grasps": options.num_grasps}
-        result |= {"threads": torch.get_num_threads(), "variants": compared(done)}
+        result = {
+            "split": "meshes" if options.meshes else options.split,
+            "scenes": options.scenes,
+            "num_grasps": options.num_grasps,
+            "threads": torch.get_num_threads(),
+            "variants": compared(done),
+        }
         if options.pictures:
             generator_pictures.rank(result["variants"], options.pictures / "generator_rank.png")
             first = done[options.variants[0]]
@@ -189,31 +196,32 @@ def attempt(
     generator: GraspGenerator, scene: Scene, view: Observation, seed: int, redrawn: int, num_grasps: int
 ) -> Trials:
     """Generate and try; no grasps where the generator gives up."""
-    grasps, seconds, error = timed(generator, view, seed, num_grasps)
-    peak = peak_megabytes()
+    grasps, cost, error = timed(generator, view, seed, num_grasps)
     world = grasps.to_frame("world", view.T_world_camera)
-    outcomes = trial.run(scene, world, default_hand(), torch.get_num_threads()) if len(world) else Outcomes.none(0)
+    outcomes = trial.run(scene, world, default_hand(), torch.get_num_threads())
     obj, likelihood = scene.object, world.log_likelihood
     return Trials(
-        obj.name, obj.category or obj.name, redrawn, error, seconds, peak,
-        world.waypoints[:, GRIP].numpy(), np.zeros(0, np.float32) if likelihood is None else likelihood.numpy(),
+        obj.name,
+        obj.category or obj.name,
+        redrawn,
+        error,
+        cost,
+        world.waypoints[:, GRIP].numpy(),
+        np.zeros(0, np.float32) if likelihood is None else likelihood.numpy(),
         np.stack([getattr(outcomes, flag) for flag in FLAGS], -1),
-    )  # fmt: skip
+    )
 
 
 def timed(generator: GraspGenerator, view: Observation, seed: int, num: int) -> tuple[Grasps, np.ndarray, str]:
-    """Grasps in the camera frame, seconds of wall and processor time, and why there are none."""
-    start = np.array([time.perf_counter(), time.process_time()])
+    """Grasps in the camera frame; seconds of wall and of processor time, and megabytes at most; why there are none."""
+    FORGET_PEAK.write_text("5")
+    start = np.array([time.perf_counter(), time.process_time(), 0])
     try:
         grasps, error = generator.generate(view, num, seed), ""
     except (RuntimeError, ValueError) as reason:  # as the interface says
         grasps, error = Grasps(torch.zeros(0, 10, 28), "camera"), str(reason)
-    return grasps, np.array([time.perf_counter(), time.process_time()]) - start, error
-
-
-def peak_megabytes() -> float:
-    """The most memory that this process has held so far, with all that is loaded."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return grasps, np.array([time.perf_counter(), time.process_time(), megabytes]) - start, error
 
 
 def load(folder: Path, scenes: int) -> dict[int, Trials]:
@@ -223,7 +231,7 @@ def load(folder: Path, scenes: int) -> dict[int, Trials]:
 
 
 def growth(setting: Setting) -> dict[str, Any]:
-    """Time of a view for more and more samples and kernels, by the median of the first scenes, and memory by then."""
+    """What a view costs with more and more samples and kernels, by the median of the first scenes."""
     views = [setting(number)[1] for number in range(NUM_GROWTH)]
     timed(KopickiGenerator(), views[0], 0, 100)  # what is loaded and compiled on the way counts for none
     result: dict[str, Any] = {"scenes": NUM_GROWTH, "threads": torch.get_num_threads()}
@@ -231,9 +239,8 @@ def growth(setting: Setting) -> dict[str, Any]:
         rows = []
         for size in sizes:
             generator = KopickiGenerator(**{name: size})
-            wall, processor = np.median([timed(generator, view, 0, 100)[1] for view in views], axis=0)
-            rows.append({name: size, "seconds": wall, "processor_seconds": processor})
-            rows[-1]["peak_megabytes"] = peak_megabytes()
+            cost = np.median([timed(generator, view, 0, 100)[1] for view in views], axis=0)
+            rows.append({name: size} | dict(zip(COSTS, cost.tolist(), strict=True)))
         result[name] = rows
     return result
 

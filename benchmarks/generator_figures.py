@@ -17,6 +17,7 @@ from dexzoo.grasp import GRASP_TYPES, POSITION, QUATERNION, TYPE
 NUM_BOOTSTRAP = 2000
 TOP = 5
 FLAGS = ("success", "collided", "starts_inside", "unstable")
+COSTS = ("seconds", "processor_seconds", "peak_megabytes")
 
 
 @dataclass(frozen=True)
@@ -24,15 +25,14 @@ class Trials:
     """What became of one variant's grasps in one scene, best first.
 
     grip: (n, 28) waypoints at the grip in the world frame. outcome: (n, 4) bool, columns FLAGS.
-    redrawn: scenes drawn before this one that could not be set or seen. seconds: of wall and processor time.
+    redrawn: scenes drawn before this one that could not be set or seen. cost: (3,) COSTS of generating.
     """
 
     object: str
     category: str
     redrawn: int
     error: str
-    seconds: np.ndarray
-    peak_megabytes: float
+    cost: np.ndarray
     grip: np.ndarray
     log_likelihood: np.ndarray
     outcome: np.ndarray
@@ -111,7 +111,7 @@ def change_of(here: Counts, there: Counts) -> dict[str, Any]:
 def summarise(rows: list[Trials]) -> dict[str, Any]:
     outcome, grip = np.concatenate([row.outcome for row in rows]), np.concatenate([row.grip for row in rows])
     success, kind = outcome[:, 0], grip[:, TYPE].astype(int)
-    wall, processor = np.array([row.seconds for row in rows]).T
+    cost = np.array([row.cost for row in rows])
     apart = np.array([apartness(row) for row in rows if len(row) > 1])
     within = [auroc(row.log_likelihood, row.success) for row in rows if 0 < row.success.sum() < len(row)]
     categories = {name: [row for row in rows if row.category == name] for name in sorted({r.category for r in rows})}
@@ -138,7 +138,7 @@ def summarise(rows: list[Trials]) -> dict[str, Any]:
             name: {
                 "scenes": len(some),
                 "grasps": int(share(some)[1].sum()),
-                "success": float(resampled(share(some))[0]),
+                "success": mean(np.concatenate([row.success for row in some])),
                 "top1": float(resampled(top1(some))[0]),
             }
             for name, some in categories.items()
@@ -146,9 +146,10 @@ def summarise(rows: list[Trials]) -> dict[str, Any]:
         "wrist_distance": mean(apart[:, 0]) if len(apart) else None,
         "wrist_angle": mean(apart[:, 1]) if len(apart) else None,
         "tenths": [rate(resampled(counts)) for counts in tenths(rows)],
-        "seconds": {"median": float(np.median(wall)), "max": float(wall.max())},
-        "processor_seconds": {"median": float(np.median(processor)), "max": float(processor.max())},
-        "peak_megabytes": max(row.peak_megabytes for row in rows),
+        **{
+            name: {"median": float(np.median(spent)), "max": float(spent.max())}
+            for name, spent in zip(COSTS, cost.T, strict=True)
+        },
     }
 
 

@@ -43,7 +43,7 @@ def rank(variants: dict[str, dict[str, Any]], path: Path) -> None:
 
 
 def cost(growth: dict[str, Any], path: Path) -> None:
-    """Seconds and memory against the number of samples and of kernels."""
+    """Seconds against the number of samples and of kernels."""
     figure, panels = plt.subplots(1, 2, figsize=(8, 3.4), sharey=True, layout="constrained")
     for axes, name in zip(panels, ("num_samples", "num_kernels"), strict=True):
         size = [row[name] for row in growth[name]]
@@ -54,7 +54,7 @@ def cost(growth: dict[str, Any], path: Path) -> None:
         axes.set_xticks(size, [f"{value:,}" for value in size], minor=False)
         axes.minorticks_off()
         axes.grid(alpha=0.3)
-    panels[0].set_ylabel(f"seconds a view, {growth['threads']} threads")
+    panels[0].set_ylabel(f"seconds a view, threads: {growth['threads']}")
     panels[0].legend(fontsize=8)
     written(figure, path)
 
