@@ -145,7 +145,7 @@ def summarise(rows: list[Trials]) -> dict[str, Any]:
         },
         "wrist_distance": mean(apart[:, 0]) if len(apart) else None,
         "wrist_angle": mean(apart[:, 1]) if len(apart) else None,
-        "tenths": [rate(resampled(counts)) for counts in tenths(rows)],
+        "tenths": [{"grasps": int(counts[1].sum()), **rate(resampled(counts))} for counts in tenths(rows)],
         **{
             name: {"median": float(np.median(spent)), "max": float(spent.max())}
             for name, spent in zip(COSTS, cost.T, strict=True)
@@ -159,7 +159,7 @@ def mean(values: np.ndarray | list[float]) -> float | None:
 
 def auroc(score: np.ndarray, success: np.ndarray) -> float | None:
     """The chance that a grasp that holds scores above one that fails; a tie counts half."""
-    held, failed = score[success], score[~success]
+    held, failed = score[success].astype(float), score[~success].astype(float)
     if not len(held) or not len(failed):
         return None
     return float(mannwhitneyu(held, failed).statistic / (len(held) * len(failed)))

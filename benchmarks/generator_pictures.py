@@ -26,10 +26,10 @@ SIZE, FOCAL = 180, 310
 def rank(variants: dict[str, dict[str, Any]], path: Path) -> None:
     """How many hold in each tenth of the generator's order, with intervals, and what of it is known of the thesis."""
     figure, axes = plt.subplots(figsize=(6.4, 4), layout="constrained")
-    middle = 10 * np.arange(10) + 5
     for name, found in variants.items():
-        mid = 100 * np.array([row["rate"] for row in found["tenths"]])
-        low, high = 100 * np.array([row["interval"] for row in found["tenths"]]).T
+        tenths = {10 * i + 5: row for i, row in enumerate(found["tenths"]) if row["grasps"]}
+        middle, mid = list(tenths), [100 * row["rate"] for row in tenths.values()]
+        low, high = 100 * np.array([row["interval"] for row in tenths.values()]).T
         (line,) = axes.plot(middle, mid, marker="o", label=f"{name}, {found['scenes']} scenes")
         axes.fill_between(middle, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
         axes.plot(0, 100 * found["top1"]["rate"], marker="*", markersize=11, color=line.get_color(), clip_on=False)
@@ -80,11 +80,14 @@ def top(
     for number in list(firsts.values())[:NUM_OBJECTS]:
         row, (scene, view, _, _) = scenes[number], setting(number)
         for place in range(num):
+            name = f"{place + 1}:" if place else f"{row.object}, 1:"
             if place < len(row):
-                pictures.append(shown(scene, view.T_world_camera, row.grip[place], bool(row.success[place])))
+                holds = bool(row.success[place])
+                pictures.append(shown(scene, view.T_world_camera, row.grip[place], holds))
+                titles.append(f"{name} {'holds' if holds else 'fails'}")
             else:
                 pictures.append(np.full((SIZE, SIZE, 3), 255, np.uint8))
-            titles.append(f"{row.object}, 1st" if place == 0 else str(place + 1))
+                titles.append(f"{name} none")
     plots.save(plots.grid(pictures, titles, columns=2 * num), path)
 
 

@@ -68,8 +68,8 @@ def generators(found: dict[str, Any]) -> str:
         [
             f"`benchmarks/generator.py`; {first['scenes']} scenes of {first['objects']} {found['split']} objects, one "
             f"view and at most {found['num_grasps']} grasps each, one trial of each grasp; intervals are 95 % "
-            f"bootstrap over scenes. The grasps of `{name}` that hold are of {first['types_among_successes']} types, and "
-            f"the first of a scene holds {points(first['top1_above_all'])} more often than all do.\n",
+            f"bootstrap over scenes. The grasps of `{name}` that hold are of {first['types_among_successes']} types, "
+            f"and the first of a scene holds {points(first['top1_above_all'])} more often than all do.\n",
             *tables[:1],
             *against,
             f"Time of a view (threads: {found['threads']}), most memory of the process with all that it has loaded, "
