@@ -122,6 +122,8 @@ def main() -> None:
         if not options.done:
             run({name: known[name] for name in options.variants}, setting, folder, options.scenes, options.num_grasps)
         done = {name: load(folder / name, options.scenes) for name in options.variants}
+        if not done[options.variants[0]]:
+            parser.error(f"folder {folder} holds nothing of {options.variants[0]}; run without --done first")
         result = {
             "split": "meshes" if options.meshes else options.split,
             "scenes": options.scenes,
