@@ -3,13 +3,10 @@
 python benchmarks/report.py
 """
 
-import json
-from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parent.parent
-RESULTS = ROOT / "benchmarks" / "results"
-BEGIN, END = "<!-- figures: benchmarks/report.py -->", "<!-- end of figures -->"
+from generator_report import generator
+from tables import ROOT, percent, read, span, table, with_figures
 
 
 def main() -> None:
@@ -22,24 +19,8 @@ def main() -> None:
     views.write_text(with_figures(views.read_text(), sensor()))
     sheet = ROOT / "docs" / "objects.md"
     sheet.write_text(with_figures(sheet.read_text(), objects()))
-
-
-def read(name: str) -> dict[str, Any]:
-    return json.loads((RESULTS / f"{name}.json").read_text())
-
-
-def with_figures(text: str, figures: str) -> str:
-    """The text with what stands between the markers replaced."""
-    before, rest = text.split(BEGIN)
-    return f"{before}{BEGIN}\n{figures}{END}{rest.split(END)[1]}"
-
-
-def percent(value: float) -> str:
-    return f"{100 * value:.1f} %"
-
-
-def span(interval: list[float], scale: float = 1.0, digits: int = 3) -> str:
-    return f"{scale * interval[0]:.{digits}f} to {scale * interval[1]:.{digits}f}"
+    grasps = ROOT / "docs" / "generator.md"
+    grasps.write_text(with_figures(grasps.read_text(), generator()))
 
 
 def summary() -> str:
@@ -361,11 +342,6 @@ def page() -> str:
         ),
     ]
     return "\n".join(parts)
-
-
-def table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(lines + ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]) + "\n"
 
 
 if __name__ == "__main__":

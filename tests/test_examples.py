@@ -65,11 +65,14 @@ def test_the_demo_ranks_verifies_and_draws(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"grasp.png", "lift.png"}
 
 
-def test_the_figures_are_those_that_the_benchmarks_wrote() -> None:
+def test_the_figures_are_those_that_the_benchmarks_wrote(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
     report = runpy.run_path(str(ROOT / "benchmarks" / "report.py"))
     assert report["with_figures"](README, report["summary"]()) == README
     card = (ROOT / "docs" / "data.md").read_text()
     assert report["with_figures"](card, report["counts"]()) == card
     views = (ROOT / "docs" / "sensor.md").read_text()
     assert report["with_figures"](views, report["sensor"]()) == views
+    grasps = (ROOT / "docs" / "generator.md").read_text()
+    assert report["with_figures"](grasps, report["generator"]()) == grasps
     assert (ROOT / "docs" / "results.md").read_text() == report["page"]()
