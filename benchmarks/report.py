@@ -159,6 +159,7 @@ def between(values: list[int]) -> str:
 def labels(found: dict[str, Any]) -> str:
     """How far the labels can be trusted, and how fast they come."""
     curves, timed, creep = found["agreement_with_itself_when_moved"], found["timed"], found["creep"]
+    slid, true = creep["working"], creep["reference"]
     names = {
         "working": "the working setting, as labels are made",
         "reference": "the reference setting",
@@ -208,8 +209,10 @@ def labels(found: dict[str, Any]) -> str:
             "Processor seconds of a trial by the size of its batch:\n",
             table(tuple(batches), [tuple(f"{cost:.3f}" for cost in batches.values())]),
             f"The objects of {creep['grasps']} grasps, held for another {creep['seconds']:.0f} s, slide by "
-            f"{creep['median_mm']:.2f} mm in the median; {percent(creep['share_below_2_mm'])} of them by less than "
-            f"2 mm, the farthest by {creep['farthest_mm']:.1f} mm.\n",
+            f"{slid['median_mm']:.2f} mm in the median; {percent(slid['share_below_2_mm'])} of them by less than "
+            f"2 mm, the farthest by {slid['farthest_mm']:.1f} mm. At the reference setting it is "
+            f"{true['median_mm']:.2f} mm in the median, {percent(true['share_below_2_mm'])} and "
+            f"{true['farthest_mm']:.1f} mm.\n",
             "Where the time of a step goes once an object is held:\n",
             table(tuple(found["profile"]), [tuple(percent(share) for share in found["profile"].values())]),
             "Grasps by category, and on how many of them the two settings disagree:\n",

@@ -35,6 +35,7 @@ from dexzoo.sim.shapes import make_object
 from dexzoo.verification import verify
 from dexzoo.viewer import view
 
+GENERATOR = "kopicki, heuristic, or a folder of demonstrations that Kopicki's learns from"
 TRAINING = ("fit", "validate", "test", "predict")
 OK, FAILED, WRONG_CALL = 0, 1, 2
 Result = tuple[dict[str, Any], Table | None]
@@ -115,6 +116,7 @@ def _parser() -> ArgumentParser:
     command = add("plan", "Propose and rank grasps for one depth image.")
     add_observation(command)
     command.add_argument("--num_grasps", type=PositiveInt, default=100, help="candidates to generate")
+    command.add_argument("--generator", default="kopicki", help=GENERATOR)
     command.add_argument("--refine", action="store_true", help="refine the twenty best")
     command.add_argument("--out", type=Path, help="folder for grasps.safetensors, plan.json and pictures")
 
@@ -132,6 +134,7 @@ def _parser() -> ArgumentParser:
     command.add_argument("--friction", type=float, help="sliding friction (default 0.7, or the named object's)")
     command.add_argument("--grasps", type=Path, help="file of grasps in the world frame; otherwise they are generated")
     command.add_argument("--num_grasps", type=PositiveInt, default=50, help="candidates to generate from one view")
+    command.add_argument("--generator", default="kopicki", help=GENERATOR)
     command.add_argument("--evaluator", default="em2", help="name or path of the model that ranks them")
     command.add_argument(
         "--trials", type=PositiveInt, default=1, help="repetitions under drawn mass, friction and wrist error"
@@ -143,7 +146,7 @@ def _parser() -> ArgumentParser:
     command.add_argument("--workers", type=PositiveInt, default=1, help="processes")
     command.add_argument("--ray", help="instead of processes, a Ray cluster: auto, its address, or local for one here")
     command.add_argument("--split", choices=[*SPLITS, ALL], default=ALL, help="whose objects")
-    command.add_argument("--generator", choices=list_generators(), default="heuristic", help="what proposes grasps")
+    command.add_argument("--generator", choices=list_generators(), default="kopicki", help="what proposes grasps")
     command.add_argument("--num_grasps", type=PositiveInt, default=100, help="grasps to generate in each scene")
     command.add_argument("--num_views", type=PositiveInt, default=4, help="views of each scene")
     command.add_argument("--trials", type=PositiveInt, default=1, help="more than 1: repetitions behind success_rate")
@@ -170,7 +173,8 @@ def _plan(options: Namespace) -> Result:
     _check_folder(options.out)
     observation = Observation.load(options.depth, options.camera)
     with _err.status("generating, scoring and refining grasps" if options.refine else "generating and scoring grasps"):
-        result = plan(observation, options.evaluator, options.num_grasps, 20 if options.refine else 0, options.seed)
+        num_refined = 20 if options.refine else 0
+        result = plan(observation, options.evaluator, options.num_grasps, num_refined, options.seed, options.generator)
     rows = _plan_rows(result)
     if options.out is not None:
         picture = plots.grasp_picture(observation, default_hand(), result.grasps[0])
@@ -252,7 +256,7 @@ def _verify(options: Namespace) -> Result:
             )
     else:
         with _err.status("generating and scoring grasps"):
-            result = plan(observation, options.evaluator, options.num_grasps, 0, options.seed)
+            result = plan(observation, options.evaluator, options.num_grasps, 0, options.seed, options.generator)
         grasps, scores = result.grasps, result.score.tolist()
     with _err.status("executing grasps in simulation"):
         outcomes = verify(grasps, scene, options.seed, options.trials)

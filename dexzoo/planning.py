@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from dexzoo.camera import Observation
-from dexzoo.generators.heuristic import HeuristicGenerator
+from dexzoo.generators import make_generator
+from dexzoo.generators.generator import GraspGenerator
 from dexzoo.grasp import Grasps
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
@@ -29,12 +30,16 @@ class Plan:
     generator_rank: Tensor
 
 
-def generate(observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
+def generate(
+    observation: Observation, num_grasps: int = 100, seed: int = 0, generator: str | GraspGenerator = "kopicki"
+) -> Grasps:
     """At most `num_grasps` grasps in the camera frame, best first; the same for the same seed.
 
+    generator: "kopicki", "heuristic", a folder of demonstrations that Kopicki's learns from, or an object.
     Raises ValueError when too little of the object is seen, RuntimeError when no feasible grasp is found.
     """
-    return HeuristicGenerator().generate(observation, num_grasps, seed)
+    chosen = make_generator(generator) if isinstance(generator, str) else generator
+    return chosen.generate(observation, num_grasps, seed)
 
 
 def plan(
@@ -43,6 +48,7 @@ def plan(
     num_grasps: int = 100,
     num_refined: int = 0,
     seed: int = 0,
+    generator: str | GraspGenerator = "kopicki",
 ) -> Plan:
     """Generate grasps, rank them by the evaluator and refine the best `num_refined`.
 
@@ -51,7 +57,7 @@ def plan(
     Raises what `generate` and `dexzoo.load` raise.
     """
     model = load(evaluator) if isinstance(evaluator, str) else evaluator
-    generated = generate(observation, num_grasps, seed)
+    generated = generate(observation, num_grasps, seed, generator)
     score = model.score(observation, generated)
     order = score.argsort(descending=True, stable=True)
     grasps, score = generated[order], score[order]

@@ -4,7 +4,6 @@ import json
 import runpy
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -37,7 +36,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 @pytest.fixture(autouse=True)
 def fewer_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planning, "HeuristicGenerator", partial(HeuristicGenerator, 500))
+    monkeypatch.setattr(planning, "make_generator", lambda name: HeuristicGenerator(500))
 
 
 @pytest.fixture(scope="session")
@@ -119,7 +118,7 @@ def test_plan_repeats_itself(run: Run, observed: list[object]) -> None:
 def test_no_feasible_grasp_is_a_failure_of_the_work(
     run: Run, observed: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(planning, "HeuristicGenerator", partial(HeuristicGenerator, 1))
+    monkeypatch.setattr(planning, "make_generator", lambda name: HeuristicGenerator(1))
     status, out, err = run("plan", *observed, "--out", tmp_path / "out")
     assert (status, out) == (1, "")
     assert err == "dexzoo: no feasible grasp is found: the object may be too large, too flat or out of reach\n"

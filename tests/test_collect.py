@@ -252,7 +252,7 @@ def test_a_scene_without_a_success_is_skipped(monkeypatch: pytest.MonkeyPatch) -
     ("wrong", "message"),
     [
         ({"split": "holdout"}, "split 'holdout' is unknown; use one of train, validation, test, all"),
-        ({"generator": "magic"}, "generator 'magic' is unknown; use one of heuristic, kopicki"),
+        ({"generator": "magic"}, "generator 'magic' is unknown; use one of kopicki, heuristic"),
         ({"num_grasps": 9}, "num_grasps is 9, but scenes of fewer than 10 are skipped"),
         ({"num_views": 0}, "num_views is 0"),
     ],

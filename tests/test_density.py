@@ -45,15 +45,16 @@ def test_likelihood_is_the_product_over_all_kernels(density: GraspDensity, grips
     expected = []
     for row, demo in enumerate(grips.demo.tolist()):
         total = 0.0
-        for column in density.active[demo].nonzero().squeeze(-1).tolist():
+        columns = density.active[demo].nonzero().squeeze(-1).tolist()
+        for column in columns:
             pose = links[row, density.links[demo, column]].double().numpy()
             q = rotation.from_matrix(torch.tensor(pose[:3, :3])).numpy()
             apart = ((density.kernel_position[demo, column].double().numpy() - pose[:3, 3]) ** 2).sum(-1) / 0.005**2
             cosine = np.abs(density.kernel_quaternion[demo, column].double().numpy() @ q)
             weight = density.log_weight[demo, column].double().exp().numpy()
             link = (weight * np.exp(-apart - 200 * (1 - cosine))).sum()
-            total += np.log(link + density.floor) - np.log(density.floor)
-        expected.append(total)
+            total += np.log((link + density.floor) / (1 + link) / density.floor)
+        expected.append(total / np.sqrt(len(columns)))
     contact = density.log_likelihood(grips, density.neighbours(grips, num=800)) - density.log_posture(grips)
     np.testing.assert_allclose(contact.numpy(), expected, atol=5e-3)
     near = density.log_likelihood(grips) - density.log_posture(grips)

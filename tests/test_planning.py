@@ -25,7 +25,7 @@ class NearIsGood(GraspEvaluator):
 @pytest.fixture(autouse=True)
 def generated(can_grasps: Grasps, monkeypatch: pytest.MonkeyPatch) -> Grasps:
     """What the generator gives is known beforehand."""
-    monkeypatch.setattr(planning, "generate", lambda observation, num_grasps, seed: can_grasps[:num_grasps])
+    monkeypatch.setattr(planning, "generate", lambda observation, num_grasps, seed, generator: can_grasps[:num_grasps])
     return can_grasps
 
 

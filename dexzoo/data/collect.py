@@ -20,7 +20,6 @@ from dexzoo.data.schema import SPLITS, decode_path, encode_path, encode_view
 from dexzoo.data.workers import in_processes, on_ray
 from dexzoo.data.writer import GraspSetWriter, SceneRows, scene_rows
 from dexzoo.generators import list_generators, make_generator
-from dexzoo.generators.generator import GraspGenerator
 from dexzoo.grasp import Grasps
 from dexzoo.hand import default_hand
 from dexzoo.sim import Outcomes, Scene, trial
@@ -50,7 +49,7 @@ class Configuration:
 
     seed: int = 0
     split: str = ALL
-    generator: str = "heuristic"
+    generator: str = "kopicki"
     num_grasps: int = 100
     num_views: int = 4
     trials: int = 1
@@ -220,15 +219,10 @@ def _look(scene: Scene, num: int, rng: np.random.Generator) -> list[tuple[int, O
 def _generate(configuration: Configuration, observation: Observation, seed: int) -> Grasps:
     """What is generated for a view, in the world frame; nothing where the generator gives up."""
     try:
-        grasps = _generator(configuration.generator).generate(observation, configuration.num_grasps, seed)
+        grasps = make_generator(configuration.generator).generate(observation, configuration.num_grasps, seed)
     except (ValueError, RuntimeError):  # as the interface says
         return Grasps(torch.zeros(0, 10, 28), "world")
     return grasps.to_frame("world", observation.T_world_camera)
-
-
-@cache
-def _generator(name: str) -> GraspGenerator:
-    return make_generator(name)
 
 
 def _likelihood(grasps: Grasps) -> list[float | None]:

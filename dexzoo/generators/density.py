@@ -49,6 +49,8 @@ MAX_CONTACT = 400
 """Kernels of a contact model; more points are thinned out."""
 REFERENCE_KERNELS = 5000
 """Kernels that a query density's weights add up to, however many it is made of; Kopicki's number."""
+FLOOR = 6e-6
+"""Likelihood under which a link counts as away from the surface: that at three and a half bandwidths."""
 _CHUNK = 256
 
 
@@ -124,7 +126,7 @@ class GraspDensity:
         hand: Hand,
         num_kernels: int = 5000,
         widths: Bandwidths | None = None,
-        floor: float = 0.01,
+        floor: float = FLOOR,
         generator: torch.Generator | None = None,
     ) -> None:
         self.widths = widths or Bandwidths()
@@ -191,8 +193,7 @@ class GraspDensity:
                     position[rows, column], turn[rows, column], self.kernel_position[demo, column, :num],
                     self.kernel_turn[demo, column, :num], self.widths,
                 )  # fmt: skip
-                link = torch.logaddexp(logs.logsumexp(-1) + scale, logs.new_tensor(self.floor).log())
-                total[rows] += link - math.log(self.floor)
+                total[rows] += self._saturated(logs.logsumexp(-1) + scale) / math.sqrt(len(columns))
         return total
 
     @torch.no_grad()
@@ -238,10 +239,18 @@ class GraspDensity:
         apart = (near[0] - position[..., None, :]).square().sum(-1) / self.widths.position**2
         cosine = (((near[1] * turn[..., None, :]).sum(-1) + 1) / 4).clamp_min(1e-6).sqrt()
         logs = near[2] - apart - self.widths.concentration * (1 - cosine)
-        link = torch.logaddexp(logs.logsumexp(-1), logs.new_tensor(self.floor).log())
         active = self.active[grips.demo]
-        contact = torch.where(active, link, 0.0).sum(-1) - active.sum(-1) * math.log(self.floor)
+        contact = torch.where(active, self._saturated(logs.logsumexp(-1)), 0.0).sum(-1) / active.sum(-1).sqrt()
         return contact + self.log_posture(grips)
+
+    def _saturated(self, log_link: Tensor) -> Tensor:
+        """What one link's ln Q adds: from 0 far from all contact models up to -ln floor, where it is in contact.
+
+        (Q + floor) / (1 + Q) in place of Q: a link that the new object has no place for does not rule the others out,
+        and how many features are alike where it has one, as on a plane, says nothing more.
+        """
+        log_floor = log_link.new_tensor(self.floor).log()
+        return torch.logaddexp(log_link, log_floor) - torch.nn.functional.softplus(log_link) - log_floor
 
     def log_posture(self, grips: Grips) -> Float[Tensor, " grip"]:
         """Ln C: how near the posture is to the demonstrated path, and how near on it to the grip.

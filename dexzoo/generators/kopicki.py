@@ -6,7 +6,6 @@ on the way. Each carries its demonstration's approach and squeeze.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -17,7 +16,7 @@ from torch import Tensor
 from dexzoo import rotation
 from dexzoo.camera import Observation
 from dexzoo.generators.demonstration import Demonstration, load_demonstrations
-from dexzoo.generators.density import Bandwidths, GraspDensity, Grips, contact_models
+from dexzoo.generators.density import Bandwidths, ContactModel, GraspDensity, Grips, contact_models
 from dexzoo.generators.features import Features
 from dexzoo.generators.generator import MAX_REACH, MIN_CLEARANCE, GraspGenerator, spread
 from dexzoo.generators.search import anneal, climb
@@ -30,6 +29,11 @@ COLLISION_STEPS, COLLISION_WEIGHTS = (0.0, 0.4, 0.7, 0.9), (1.0, 1.0, 0.5, 0.2)
 """Where on the way from the pre-grasp (0) to the grip (1) collisions are looked at, and how much they count."""
 JOINT_BANDWIDTH = 0.1
 """Radians; wider than Kopicki's, so that each finger adapts to the surface by itself."""
+COLLISION_COST = 4.0
+THUMB_GAP_COST, FINGER_GAP_COST = 300.0, 100.0
+"""Log-likelihood that a metre between the surface and a finger that ought to touch it costs."""
+NUM_CLIMBED = 500
+"""Grips that are improved to the end; twice as many are at first."""
 NUM_POINTS = 300
 TABLE_COST = 1000.0
 """Log-likelihood that a metre below the least clearance costs."""
@@ -47,8 +51,8 @@ class KopickiGenerator(GraspGenerator):
     def __init__(
         self,
         demonstrations: Sequence[Demonstration] | None = None,
-        num_per_type: int = 10,
-        num_samples: int = 10_000,
+        num_per_type: int = 20,
+        num_samples: int = 30_000,
         num_kernels: int = 50_000,
         widths: Bandwidths | None = None,
         search: Literal["gradient", "annealing"] = "gradient",
@@ -83,21 +87,23 @@ class KopickiGenerator(GraspGenerator):
             raise ValueError(f"num_grasps is {num_grasps}, expected at least 1")
         generator = torch.Generator().manual_seed(seed)
         density = self.density(observation, seed)
-        way = Way(self.demonstrations, self.hand, density.surface.points, obstacles(observation), generator)
+        way = Way(
+            self.demonstrations, self.models, self.hand, density.surface.points, obstacles(observation), generator
+        )
+        share = max(NUM_CLIMBED // len(self.demonstrations), 8)
         with torch.no_grad():
             grips = density.sample(self.num_samples, generator)
-            grips = best(grips, density.screen(grips) - way.table_cost(grips), max(self.num_samples // 20, 10))
-        for num_steps, keep in zip(self.num_steps, (max(300 // len(self.demonstrations), 8), None), strict=True):
+            grips = grips[best(density.screen(grips) - way.table_cost(grips), grips.demo, 2 * share)]
+        for num_steps in self.num_steps:
             if self.search == "gradient":
                 grips = climb(density, grips, way.table_cost, num_steps)
             else:
                 grips = anneal(density, grips, way.table_cost, num_steps, generator)
             with torch.no_grad():
-                value = density.log_likelihood(grips) - way.cost(grips)
-            if keep:
-                grips = best(grips, value, keep)
-        # what two links in contact weigh: with less, nothing is held between them
-        feasible = way.feasible(grips) & (value > 2 * math.log(1 / density.floor))
+                value = density.log_likelihood(grips) - way.cost(grips) - way.gap_cost(grips)
+            kept = best(value, grips.demo, share)
+            grips, value = grips[kept], value[kept]
+        feasible = way.feasible(grips) & (value > 0)  # below, the hand does as well in the air
         if not feasible.any():
             raise RuntimeError("no feasible grasp is found: the object may be too large, too flat or out of reach")
         grasps = way.grasps(grips[feasible], value[feasible])
@@ -111,6 +117,7 @@ class Way:
     def __init__(
         self,
         demonstrations: Sequence[Demonstration],
+        models: Sequence[Sequence[ContactModel]],
         hand: Hand,
         cloud: Tensor,
         others: Tensor,
@@ -119,6 +126,12 @@ class Way:
         self.hand = hand
         self.points = _some(cloud, NUM_POINTS, generator)
         self.others = _some(others, NUM_POINTS, generator)
+        self.surface = cloud
+        fingers = list(dict.fromkeys(name.split("_")[0] for name in hand.freedoms))
+        self.finger_solids = [[i for i, n in enumerate(hand.solid_names) if n.startswith(f)] for f in fingers]
+        touching = [{hand.link_names[model.link].split("_")[0] for model in row} for row in models]
+        cost = torch.tensor([THUMB_GAP_COST if finger == "thumb" else FINGER_GAP_COST for finger in fingers])
+        self.gap_weight = cost * torch.tensor([[finger in row for finger in fingers] for row in touching])
         self.types = torch.tensor([d.grasp_type for d in demonstrations])
         keys = torch.cat([d.grasp.waypoints[:, [PREGRASP, GRIP, SQUEEZE]] for d in demonstrations])
         poses = pose_matrix(keys[..., :3], keys[..., 3:7])
@@ -148,7 +161,17 @@ class Way:
         links = self._links(grips, COLLISION_STEPS)
         depth = (-self.hand.signed_distance(links, self.points).amin(-2)).clamp_min(0)
         weight = torch.tensor(COLLISION_WEIGHTS)[:, None]
-        return self.table_cost(grips) + (weight * (torch.expm1(100 * depth))).sum((-1, -2)) * 10
+        return self.table_cost(grips) + (weight * (torch.expm1(100 * depth))).sum((-1, -2)) * COLLISION_COST
+
+    def gap_cost(self, grips: Grips) -> Tensor:
+        """Cost of fingers that touched in the demonstration and here stop short of the surface, or in it.
+
+        The product of experts knows where links may be, but only as sharply as its kernels are wide.
+        """
+        links = grips.wrist[:, None] @ self.hand.forward_kinematics(self.hand.expand(grips.joints))
+        parts = [self.hand.signed_distance(part, self.surface).amin(-1) for part in links.split(64)]
+        gap = torch.stack([torch.cat(parts)[:, solids].amin(-1) for solids in self.finger_solids], -1)
+        return (self.gap_weight[grips.demo] * gap.abs()).sum(-1)
 
     def feasible(self, grips: Grips) -> Tensor:
         """(n,) whether every link keeps clear of the table all the way."""
@@ -200,10 +223,10 @@ def _some(points: Tensor, num: int, generator: torch.Generator) -> Tensor:
     return points[torch.randperm(len(points), generator=generator)[:num]]
 
 
-def best(grips: Grips, value: Tensor, num: int) -> Grips:
-    """The `num` grips of highest value of each demonstration."""
+def best(value: Tensor, demo: Tensor, num: int) -> Tensor:
+    """Indices of the `num` highest values of each demonstration."""
     parts = []
-    for demo in grips.demo.unique():
-        rows = (grips.demo == demo).nonzero().squeeze(-1)
+    for one in demo.unique():
+        rows = (demo == one).nonzero().squeeze(-1)
         parts.append(rows[value[rows].topk(min(num, len(rows))).indices])
-    return grips[torch.cat(parts)]
+    return torch.cat(parts)
