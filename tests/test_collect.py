@@ -35,15 +35,11 @@ def make_small(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(module, "make_generator", lambda name: HeuristicGenerator(num_samples=300))
     patch.setattr(module, "object_of", lambda number, split: ("can_02", "box_04")[number % 2])
     patch.setattr(module, "in_processes", lambda function, numbers, workers: map(function, numbers))
-    module._generator.cache_clear()
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    clear = module._generator.cache_clear
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
     make_small(monkeypatch)
-    yield
-    clear()
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +48,6 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         make_small(patch)
         told = list(collect(folder, SMALL, 2))
-    module._generator.cache_clear()
     assert [line.split(":")[0] for line in told] == ["scene 0 can_02", "scene 1 box_04"]
     return folder
 
@@ -226,7 +221,7 @@ def test_scenes_that_give_up_are_kept_as_such(tmp_path: Path, monkeypatch: pytes
     def restless(*_: object) -> None:
         raise ValueError("it rolls")
 
-    monkeypatch.setattr(module, "_generator", lambda name: Hopeless())
+    monkeypatch.setattr(module, "make_generator", lambda name: Hopeless())
     assert list(collect(tmp_path, SMALL, 1)) == ["scene 0 can_02: skipped, fewer than 10 grasps are generated"]
     monkeypatch.setattr(module.Scene, "place", restless)
     assert list(collect(tmp_path, SMALL, 2))[1] == "scene 1 box_04: skipped, the object does not come to rest"
