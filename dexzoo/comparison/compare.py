@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from dexzoo.comparison.scores import (
     Labels,
     Scores,
     coin_scores,
+    first_image,
     likelihood_scores,
     measure,
     model_scores,
@@ -21,38 +22,52 @@ from dexzoo.comparison.scores import (
 )
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SOURCES, VERSION
+from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
 
 GENERATED = SOURCES[0]
 
 
-def compare(models: Sequence[str], folder: str = "assets/grasps", split: str = "test", seed: int = 0) -> dict[str, Any]:
+def load_models(models: Sequence[str]) -> dict[str, GraspEvaluator]:
+    """Models by the names of their rows: the last part of a path, or the whole where that is taken.
+
+    models: names, files, folders or addresses, as `dexzoo.load` takes them; one given twice is loaded once.
+    """
+    models = list(dict.fromkeys(models))
+    short = [Path(model).stem for model in models]
+    taken = [*short, GM, COIN]
+    names = [name if taken.count(name) == 1 else model for name, model in zip(short, models, strict=True)]
+    return {name: load(model) for name, model in zip(names, models, strict=True)}
+
+
+def compare(
+    models: Mapping[str, GraspEvaluator], data: GraspDataModule, split: str = "test", seed: int = 0
+) -> dict[str, Any]:
     """All figures of some models, of the generator's likelihood (gm) and of a coin on one split of a grasp set.
 
-    models: names, files or folders, as `dexzoo.load` takes them. folder: the grasp set, or its address. seed: of the
-    coin and of the bootstrap's draws. The same call gives the same result, but for the times in `cost`.
+    models: by the names of their rows. seed: of the coin and of the bootstrap's draws. The same call gives the same
+    result, but for the times in `cost`.
 
     Returns plain values, ready for JSON: split, seed, num_draws; data (version and checksum of the set); sources, for
-    generated grasps and, where the split has some, for perturbed and refined ones: how many grasps and scenes, the
-    success rate, and in `rows`, by name, what `figures.describe` and `figures.against` say; cost, by model. Ranks are
-    within the grasps of one source in one scene, each scored in the view that the set pairs it with. The row gm is
-    missing where the set has no likelihoods; its threshold is the best for the generated grasps of validation.
+    generated grasps and, where the split has some, for perturbed and refined ones: how many grasps, objects and scenes,
+    the success rate, and in `rows`, by name, what `figures.describe` and `figures.against` say; cost, by model. Ranks
+    are within the grasps of one source in one scene, each seen in the view that the set pairs it with. There is no row
+    gm where the set has no likelihoods; its threshold is the most accurate one for the generated grasps of validation.
 
-    Raises FileNotFoundError or ValueError for a model or a set that cannot be had, or a split without generated grasps.
+    Raises FileNotFoundError or ValueError for a set that cannot be had, or a split without generated grasps.
     """
-    loaded = {label: load(model) for label, model in row_names(models).items()}
-    data = GraspDataModule(folder)
     labels = {source: found for source in SOURCES if (found := read_labels(data, split, source))}
     if GENERATED not in labels:
         raise ValueError(f"grasp set {data.folder} has no generated grasps in its {split} split; collect more objects")
     rows: dict[str, dict[str, Scores]] = {source: {} for source in labels}
     cost = {}
-    for name, model in loaded.items():
+    image = first_image(data, split)
+    for name, model in models.items():
         for source in labels:
             dataset = data.dataset(split, model, [source])
             rows[source][name] = model_scores(model, dataset, f"{name} on {source} grasps")
             if source == GENERATED:
-                cost[name] = asdict(measure(model, dataset, data))
+                cost[name] = asdict(measure(model, image, dataset.grasps))
     validation = read_labels(data, "validation", GENERATED)
     return {
         "split": split,
@@ -64,14 +79,6 @@ def compare(models: Sequence[str], folder: str = "assets/grasps", split: str = "
     }
 
 
-def row_names(models: Sequence[str]) -> dict[str, str]:
-    """A short name for the row of each model: the last part of its path, or the whole where that is taken."""
-    models = list(dict.fromkeys(models))
-    short = [Path(model).stem for model in models]
-    taken = [*short, GM, COIN]
-    return {name if taken.count(name) == 1 else model: model for name, model in zip(short, models, strict=True)}
-
-
 def _section(labels: Labels, rows: dict[str, Scores], validation: Labels | None, seed: int) -> dict[str, Any]:
     """The figures of all rows on the grasps of one source."""
     likelihood = likelihood_scores(labels, validation)
@@ -80,6 +87,7 @@ def _section(labels: Labels, rows: dict[str, Scores], validation: Labels | None,
     draws = draw_scenes(labels.num_scenes, seed)
     return {
         "grasps": len(labels.success),
+        "objects": len(set(labels.objects)),
         "scenes": labels.num_scenes,
         "success_rate": float(labels.success.mean()),
         "rows": {

@@ -5,18 +5,20 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
 from rich.progress import track
+from torch import Tensor
 
 from dexzoo.data.datamodule import GraspDataModule, GraspDataset
 from dexzoo.data.schema import SPLITS
-from dexzoo.models.evaluator import CHUNK, GraspEvaluator
+from dexzoo.models.evaluator import CHUNK, GraspEvaluator, Scene
 
 GM, COIN = "gm", "coin"
 """The rows that every comparison has: the generative model, ranking by its own likelihood, and chance."""
@@ -28,12 +30,13 @@ _REPEATS = 3
 class Labels:
     """Grasps of one source, and what became of them.
 
-    success: (grasp,) whether each held. scene: (grasp,) from 0, without gaps. category: (scene,) the object's.
+    success: (grasp,) whether each held. scene: (grasp,) from 0, without gaps. objects, category: (scene,) names.
     log_likelihood: (grasp,) the generator's, nan where it is not known.
     """
 
     success: NDArray[np.bool_]
     scene: NDArray[np.int64]
+    objects: NDArray[np.str_]
     category: NDArray[np.str_]
     log_likelihood: NDArray[np.float32]
 
@@ -46,15 +49,15 @@ class Labels:
         """The grasps of some scenes, which are numbered anew."""
         rows = np.isin(self.scene, scenes)
         scene = np.unique(self.scene[rows], return_inverse=True)[1]
-        return Labels(self.success[rows], scene, self.category[scenes], self.log_likelihood[rows])
+        return Labels(self.success[rows], scene, self.objects[scenes], self.category[scenes], self.log_likelihood[rows])
 
 
 @dataclass(frozen=True)
 class Scores:
     """What one row says of the grasps.
 
-    score: (grasp,) the higher, the more likely to hold. threshold: above it a grasp is predicted to hold; None where
-    none could be chosen. probability: (grasp,) of success; None for a score that is no probability.
+    score: (grasp,) what ranks them, best highest. probability: (grasp,) of success; None where it gives none.
+    threshold: the probability, or else the score, above which a grasp is predicted to hold; None if none was chosen.
     """
 
     score: NDArray[np.float32]
@@ -64,7 +67,8 @@ class Scores:
     @property
     def predicted(self) -> NDArray[np.bool_] | None:
         """(grasp,) whether each is predicted to hold."""
-        return None if self.threshold is None else self.score > self.threshold
+        value = self.score if self.probability is None else self.probability
+        return None if self.threshold is None else value > self.threshold
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> Scores:
         """The scores of some grasps."""
@@ -95,30 +99,42 @@ def read_labels(data: GraspDataModule, split: str, source: str) -> Labels | None
     if not len(rows):
         return None
     shown, scene = np.unique(grasp_set.grasp_scene[rows], return_inverse=True)
-    category = np.array(grasp_set.scenes["category"].to_pylist(), str)[shown]
+    objects, category = (np.array(grasp_set.scenes[name].to_pylist(), str)[shown] for name in ("object", "category"))
     likelihood = np.asarray(grasp_set.grasps["log_likelihood"].to_numpy(), np.float32)
-    return Labels(grasp_set.success[rows], scene, category, likelihood[rows])
+    return Labels(grasp_set.success[rows], scene, objects, category, likelihood[rows])
 
 
+def first_image(data: GraspDataModule, split: str) -> Float[Tensor, "1 2 224 224"]:
+    """What evaluators see of the first view of a split."""
+    row = int(data.source.grasp_view[data.source.grasp_split == SPLITS.index(split)].min())
+    return data.source.images([row])[torch.tensor([0])]
+
+
+def encoded_views(model: GraspEvaluator, dataset: GraspDataset) -> Iterator[tuple[Tensor, Scene]]:
+    """For each view of a dataset the rows of its grasps, and what the model keeps of it, encoded once."""
+    order = dataset.view.argsort(stable=True)
+    views, count = dataset.view[order].unique_consecutive(return_counts=True)
+    for view, rows in zip(views.split(1), order.split(count.tolist()), strict=True):
+        if isinstance(dataset.views, dict):
+            yield rows, {name: value[view].to(model.device) for name, value in dataset.views.items()}
+        else:
+            yield rows, model.encode(dataset.views[view].to(model.device))
+
+
+@torch.no_grad()
 def model_scores(model: GraspEvaluator, dataset: GraspDataset, title: str) -> Scores:
-    """Log-odds of a model on each grasp, as seen in the view that the set pairs it with. Each view is encoded once.
+    """Log-odds and probabilities of a model on each grasp, seen in the view that the set pairs it with.
 
     title: of the progress bar. ValueError for a model that gives nan.
     """
-    order = dataset.view.argsort(stable=True)
-    views, count = dataset.view[order].unique_consecutive(return_counts=True)
-    parts = list(zip(views.split(1), order.split(count.tolist()), strict=True))
-    logit = np.zeros(len(dataset), np.float32)
-    with torch.no_grad():
-        for view, rows in track(parts, title, transient=True, disable=not sys.stderr.isatty()):
-            if isinstance(dataset.views, dict):
-                scene = {name: value[view].to(model.device) for name, value in dataset.views.items()}
-            else:
-                scene = model.encode(dataset.views[view].to(model.device))
-            logit[rows.numpy()] = model.logit(scene, dataset.grasps[rows][None].to(model.device))[0].float().cpu()
-    if not np.isfinite(logit).all():
-        raise ValueError(f"{title}: {np.count_nonzero(~np.isfinite(logit))} scores are no numbers; train it anew")
-    return Scores(logit, 0.0, torch.from_numpy(logit).sigmoid().numpy())
+    logit = torch.zeros(len(dataset))
+    views = encoded_views(model, dataset)
+    num_views = len(dataset.view.unique())
+    for rows, scene in track(views, title, num_views, transient=True, disable=not sys.stderr.isatty()):
+        logit[rows] = model.logit(scene, dataset.grasps[rows][None].to(model.device))[0].float().cpu()
+    if wrong := int((~logit.isfinite()).sum()):
+        raise ValueError(f"{title}: {wrong} of {len(logit)} scores are nan or infinite; the weights are of no use")
+    return Scores(logit.numpy(), 0.5, logit.sigmoid().numpy())
 
 
 def likelihood_scores(labels: Labels, validation: Labels | None) -> Scores | None:
@@ -150,15 +166,14 @@ def best_threshold(score: NDArray[np.float32], success: NDArray[np.bool_]) -> fl
     return float(np.append(below, value)[right.argmax()])
 
 
-def measure(model: GraspEvaluator, dataset: GraspDataset, data: GraspDataModule) -> Cost:
-    """Size and speed of a model, on the first view of a dataset."""
-    row = int(data.source.grasp_view[0])
-    image = data.source.images([row])[torch.tensor([0])].to(model.device)
-    grasps = dataset.grasps[torch.arange(NUM_TIMED) % len(dataset)].to(model.device)
-    with torch.no_grad():
-        scene = model.encode(image)
-        view = _best_time(lambda: model.encode(image))
-        scoring = _best_time(lambda: [model.logit(scene, part[None]) for part in grasps.split(CHUNK)])
+@torch.no_grad()
+def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: Float[Tensor, "grasp 10 28"]) -> Cost:
+    """Size of a model, and its speed on one view and some grasps, which are repeated up to 1,000."""
+    image = image.to(model.device)
+    grasps = grasps[torch.arange(NUM_TIMED) % len(grasps)].to(model.device)
+    scene = model.encode(image)
+    view = _best_time(lambda: model.encode(image))
+    scoring = _best_time(lambda: [model.logit(scene, part[None]) for part in grasps.split(CHUNK)])
     with tempfile.TemporaryDirectory() as folder:
         size = model.save(Path(folder)).stat().st_size
     return Cost(
