@@ -154,7 +154,7 @@ def _parser() -> ArgumentParser:
     command.add_argument("--images", action="store_true", help="keep the depth images; else rendered anew")
 
     command = add("compare", "Compare models, the generator's own order (gm) and a coin on grasps of unseen objects.")
-    command.add_argument("models", nargs="+", help="names, files, folders or hf:// addresses")
+    command.add_argument("models", nargs="*", help="names, files, folders or hf:// addresses; default: all shipped")
     command.add_argument("--data", default="assets/grasps", help="grasp set: a folder, or an address such as s3://...")
     command.add_argument("--split", choices=SPLITS, default="test", help="whose grasps")
     command.add_argument("--out", type=Path, help="folder for comparison.md, comparison.json and pictures")

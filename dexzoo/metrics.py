@@ -62,7 +62,7 @@ class SceneMetric(Metric):
 
     def compute(self) -> Tensor:
         """The mean over scenes; nan before any update."""
-        rate: Tensor = self.by_scene().nanmean(0) if self.preds else torch.tensor(float("nan"))
+        rate: Tensor = self.by_scene().nanmean(0) if len(self.preds) else torch.tensor(float("nan"))
         return rate
 
     def _ranked(self) -> _Ranking:

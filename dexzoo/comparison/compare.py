@@ -23,7 +23,7 @@ from dexzoo.comparison.scores import (
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SOURCES, VERSION
 from dexzoo.models.evaluator import GraspEvaluator
-from dexzoo.models.zoo import load
+from dexzoo.models.zoo import list_models, load, shipped_card
 
 GENERATED = SOURCES[0]
 
@@ -31,9 +31,10 @@ GENERATED = SOURCES[0]
 def load_models(models: Sequence[str]) -> dict[str, GraspEvaluator]:
     """Models by the names of their rows: the last part of a path, or the whole where that is taken.
 
-    models: names, files, folders or addresses, as `dexzoo.load` takes them; one given twice is loaded once.
+    models: names, files, folders or addresses, as `dexzoo.load` takes them; one given twice is loaded once, and if none
+    is given, all that come with weights are.
     """
-    models = list(dict.fromkeys(models))
+    models = list(dict.fromkeys(models)) or [name for name in list_models() if shipped_card(name)]
     short = [Path(model).stem for model in models]
     taken = [*short, GM, COIN]
     names = [name if taken.count(name) == 1 else model for name, model in zip(short, models, strict=True)]
