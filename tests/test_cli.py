@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import synthetic
 import torch
 import trimesh
 from safetensors.torch import save_file
@@ -435,3 +436,46 @@ def test_failures_of_the_machine_are_status_1(
 
     monkeypatch.setattr(cli, "plan", stopped)
     assert run("plan", *observed) == (1, "", "dexzoo: stopped\n")
+
+
+# compare
+
+
+def test_compare_tells_which_model_to_use(run: Run, weights: Path, tmp_path: Path) -> None:
+    grasps, out = synthetic.write(tmp_path / "grasps", num_grasps=8), tmp_path / "new" / "out"
+    status, text, err = run("compare", weights, "--data", grasps, "--out", out)
+    assert (status, err) == (0, "")
+    assert "8 generated grasps of 1 objects in 1 scenes" in " ".join(text.split())
+    for name in ("top-1", weights.stem, "gm", "coin"):
+        assert name in text
+    written = {path.name for path in out.iterdir()}
+    assert written == {
+        "comparison.md",
+        "comparison.json",
+        "rank.png",
+        "reliability.png",
+        "categories.png",
+        "em2_maps.png",
+        "em2_grasps.png",
+    }
+    status, text, err = run("compare", weights, "--data", grasps, "--json")
+    assert (status, err) == (0, "")
+    again, first = json.loads(text), json.loads((out / "comparison.json").read_text())
+    assert again["sources"] == first["sources"]
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["emm2"], "did you mean em2"),
+        (["nosuch.safetensors"], "do not exist"),
+        (["em2", "--data", "nosuch"], "grasp set nosuch"),
+        (["em2", "--split", "val"], "--split"),
+        (["em2", "--out", "pyproject.toml"], "--out pyproject.toml is a file"),
+    ],
+)
+def test_wrong_comparisons_are_told_in_one_line(run: Run, args: list[str], message: str) -> None:
+    status, out, err = run("compare", *args)
+    assert (status, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1

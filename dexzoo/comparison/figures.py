@@ -127,7 +127,7 @@ def counts(labels: Labels, scores: Scores) -> dict[str, int] | None:
     }
 
 
-def reliability(labels: Labels, scores: Scores) -> list[dict[str, float | None]] | None:
+def reliability(labels: Labels, scores: Scores) -> list[dict[str, Any]] | None:
     """The reliability diagram."""
     if scores.probability is None:
         return None
@@ -154,7 +154,7 @@ def against(labels: Labels, scores: Scores, other: Scores) -> dict[str, Any]:
     return found
 
 
-def cross_table(right: NDArray[np.bool_], other_right: NDArray[np.bool_]) -> dict[str, float | int]:
+def cross_table(right: NDArray[np.bool_], other_right: NDArray[np.bool_]) -> dict[str, Any]:
     """The four cells, and McNemar's exact p: of a split at least as uneven among the cases in which they differ."""
     alone, other_alone = int((right & ~other_right).sum()), int((~right & other_right).sum())
     differ = alone + other_alone
@@ -167,7 +167,7 @@ def cross_table(right: NDArray[np.bool_], other_right: NDArray[np.bool_]) -> dic
     }
 
 
-def _of_category(name: str, labels: Labels, scores: Scores) -> dict[str, float | int | None]:
+def _of_category(name: str, labels: Labels, scores: Scores) -> dict[str, Any]:
     scenes = np.flatnonzero(labels.category == name)
     part = labels[scenes]
     found = figures(part, scores[np.isin(labels.scene, scenes)], np.ones((1, part.num_scenes)))

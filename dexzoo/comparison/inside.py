@@ -80,8 +80,10 @@ def maps_picture(image: Float[Tensor, "1 2 224 224"], maps: Float[Tensor, "chann
     for place, (title, panel) in enumerate(panels.items(), 1):
         axes = figure.add_subplot(4, _COLUMNS, place)
         seen = panel[image[0, 0] > 0] if title in channels else panel
-        low, high = np.percentile(seen, [1, 99])
-        axes.imshow(panel, cmap="gray" if title in channels else "viridis", vmin=low, vmax=max(high, low + 1e-9))
+        low, high = np.percentile(seen.numpy(), [1, 99])
+        axes.imshow(
+            panel.numpy(), cmap="gray" if title in channels else "viridis", vmin=low, vmax=max(high, low + 1e-9)
+        )
         axes.set_title(title, fontsize=9)
         axes.set_axis_off()
     return figure
@@ -103,7 +105,8 @@ def components_picture(
         for j, (title, points) in enumerate(spaces.items()):
             axes = figure.add_subplot(2, 2, 1 + 2 * i + j)
             for label, chosen in colouring.items():
-                axes.scatter(points[chosen, 0], points[chosen, 1], s=7, alpha=0.6, linewidth=0, label=label)
+                x, y = points[chosen].numpy().T
+                axes.scatter(x, y, s=7, alpha=0.6, linewidth=0, label=label)
             axes.set(xticks=[], yticks=[], title=title)
             if j:
                 axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), markerscale=2)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,8 +37,8 @@ class Labels:
 
     success: NDArray[np.bool_]
     scene: NDArray[np.int64]
-    objects: NDArray[np.str_]
-    category: NDArray[np.str_]
+    objects: NDArray[Any]
+    category: NDArray[Any]
     log_likelihood: NDArray[np.float32]
 
     @property
