@@ -71,7 +71,7 @@ class Scores:
         value = self.score if self.probability is None else self.probability
         return None if self.threshold is None else value > self.threshold
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> Scores:
+    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Scores:
         """The scores of some grasps."""
         probability = None if self.probability is None else self.probability[rows]
         return Scores(self.score[rows], self.threshold, probability)
