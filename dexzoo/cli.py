@@ -19,9 +19,9 @@ from rich.table import Table
 
 from dexzoo import plots, training
 from dexzoo.camera import Observation
-from dexzoo.comparison.compare import GENERATED, compare, load_models
+from dexzoo.comparison.compare import compare, load_models
 from dexzoo.comparison.inside import draw_inside
-from dexzoo.comparison.report import main_table, title, write
+from dexzoo.comparison.report import terminal_table, write
 from dexzoo.data.collect import ALL, Configuration, collect
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
@@ -323,12 +323,7 @@ def _compare(options: Namespace) -> Result:
     if options.out is not None:
         write(result, options.out)
         draw_inside(models, data, options.split, options.out)
-    generated = result["sources"][GENERATED]
-    head, *rows = main_table(generated)
-    table = Table(*head, title=title(GENERATED, generated))
-    for row in rows:
-        table.add_row(*(re.sub(r"\*\*(.*?)\*\*", r"[bold]\1[/bold]", cell) for cell in row))
-    return result, table
+    return result, terminal_table(result)
 
 
 def _demonstrate(options: Namespace) -> Result:

@@ -160,7 +160,7 @@ class CalibrationError(Metric):
 
     Grasps are put into num_bins bins of equal width by their probability; the distance is between each bin's mean
     probability and its success rate (Guo et al. 2017, equation 3). `bins` gives the reliability diagram. torchmetrics'
-    BinaryCalibrationError gives the same number, without the diagram, and keeps every grasp; this one keeps sums.
+    BinaryCalibrationError gives the same number without the diagram, and keeps every grasp; this one keeps sums.
 
     >>> metric = CalibrationError()
     >>> metric.update(torch.tensor([0.7, 0.7, 0.7, 0.7]), torch.tensor([1, 1, 0, 0]))

@@ -446,8 +446,9 @@ def test_compare_tells_which_model_to_use(run: Run, weights: Path, tmp_path: Pat
     status, text, err = run("compare", weights, "--data", grasps, "--out", out)
     assert (status, err) == (0, "")
     assert "8 generated grasps of 1 objects in 1 scenes" in " ".join(text.split())
-    for name in ("top-1", weights.stem, "gm", "coin"):
+    for name in ("accuracy", "AUROC", "calibration", "top-1", weights.stem, "gm", "coin"):
         assert name in text
+    assert max(len(line) for line in text.splitlines()) <= 80
     written = {path.name for path in out.iterdir()}
     assert written == {
         "comparison.md",

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from rich import box
+from rich.table import Table
 
 from dexzoo.comparison.charts import draw_charts
 
@@ -31,6 +35,7 @@ _COLUMNS = {
     "top1": _Column("top-1", 100, 1, with_interval=True),
     "top5": _Column("top-5", 100, 1),
 }
+_BRIEF = ("accuracy", "auroc", "scene_auroc", "calibration_error", "top1", "top5")
 _COUNTS = {"tp": "tp", "fp": "fp", "tn": "tn", "fn": "fn"}
 _CROSS = {"both": "both hold", "only_this": "only this", "only_gm": "only gm", "neither": "neither"}
 _COST = {
@@ -49,23 +54,37 @@ best of each column is bold.
 """
 
 
-def main_table(section: dict[str, Any]) -> Cells:
-    """The figures of one source, the best of each column between asterisks."""
+def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
+    """The figures of one source, the best of each column between asterisks.
+
+    brief: only those that fit into a terminal, without intervals.
+    """
     rows: dict[str, Any] = section["rows"]
-    table = [["", *(column.heading for column in _COLUMNS.values()), "p"]]
-    best = {name: _best([row["figures"].get(name) for row in rows.values()], name) for name in _COLUMNS}
+    columns = {name: column for name, column in _COLUMNS.items() if not brief or name in _BRIEF}
+    table = [["", *(column.heading for column in columns.values()), "p"]]
+    best = {name: _best([row["figures"].get(name) for row in rows.values()], name) for name in columns}
     for label, row in rows.items():
         cells = []
-        for name, column in _COLUMNS.items():
+        for name, column in columns.items():
             figure = row["figures"].get(name, {"value": None})
             cell = _number(figure["value"], column)
             if figure["value"] is not None and figure["value"] == best[name]:
                 cell = f"**{cell}**"
-            if column.with_interval and figure.get("interval"):
+            if column.with_interval and not brief and figure.get("interval"):
                 cell += " ({} to {})".format(*(_number(end, column) for end in figure["interval"]))
             cells.append(cell)
         table.append([label, *cells, _p(row.get("against_gm", {}).get("top1"))])
     return table
+
+
+def terminal_table(result: dict[str, Any]) -> Table:
+    """The main table of the first source, the generated grasps, for a terminal of 80 columns."""
+    source, section = next(iter(result["sources"].items()))
+    head, *rows = main_table(section, brief=True)
+    shown = Table(*head, title=title(source, section), box=box.SIMPLE)
+    for row in rows:
+        shown.add_row(*(re.sub(r"\*\*(.*?)\*\*", r"[bold]\1[/bold]", cell) for cell in row))
+    return shown
 
 
 def counts_table(section: dict[str, Any]) -> Cells:
