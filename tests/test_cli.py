@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 
 from dexzoo import cli, planning
 from dexzoo.camera import Observation
+from dexzoo.comparison import scores
 from dexzoo.data import collect as collecting
 from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import GRASP_TYPES, Grasps
@@ -441,7 +442,10 @@ def test_failures_of_the_machine_are_status_1(
 # compare
 
 
-def test_compare_tells_which_model_to_use(run: Run, weights: Path, tmp_path: Path) -> None:
+def test_compare_tells_which_model_to_use(
+    run: Run, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scores, "NUM_TIMED", 8)  # a thousand take EM2 seconds
     grasps, out = synthetic.write(tmp_path / "grasps", num_grasps=8), tmp_path / "new" / "out"
     status, text, err = run("compare", weights, "--data", grasps, "--out", out)
     assert (status, err) == (0, "")
