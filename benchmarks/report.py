@@ -238,7 +238,7 @@ def labels(found: dict[str, Any]) -> str:
 
 def evaluators(found: dict[str, Any]) -> str:
     """The comparison's own tables, and its charts."""
-    parts = ["## Evaluators\n", f"`benchmarks/comparison.py`; {NOTES}"]
+    parts = ["## Evaluators\n", f"`benchmarks/comparison.py`. {NOTES}"]
     for source, section in found["sources"].items():
         parts += [f"{title(source, section)}:\n", markdown_table(main_table(section))]
         parts += [markdown_table(counts_table(section))] if source == "generated" else []
