@@ -8,6 +8,9 @@ from typing import Any
 from generator_report import generator
 from tables import ROOT, percent, read, span, table, with_figures
 
+from dexzoo.comparison.report import NOTES, cost_table, counts_table, main_table, title
+from dexzoo.comparison.report import table as markdown_table
+
 
 def main() -> None:
     readme = ROOT / "README.md"
@@ -24,21 +27,17 @@ def main() -> None:
 
 
 def summary() -> str:
-    em2, grip = read("em2"), read("refine")["groups"]["grip: 20 steps, wrist and 15 joints"]
-    generated, top1 = em2["generated"], em2["generated"]["top1"]
+    grip = read("refine")["groups"]["grip: 20 steps, wrist and 15 joints"]
+    generated = read("comparison")["sources"]["generated"]
+    em2, gm = (generated["rows"][name]["figures"] for name in ("em2", "gm"))
+    auroc, first, own = em2["auroc"], em2["top1"], gm["top1"]
     rows = [
-        (
-            "AUROC of `em2` on generated grasps of unseen objects",
-            f"{generated['auroc']:.3f} ({span(generated['auroc_interval'])})",
-        ),
+        ("AUROC of `em2` on generated grasps of unseen objects", f"{auroc['value']:.3f} ({span(auroc['interval'])})"),
         (
             "success of the grasp that `em2` ranks first",
-            f"{percent(top1['evaluator']['rate'])} ({span(top1['evaluator']['interval'], 100, 1)})",
+            f"{percent(first['value'])} ({span(first['interval'], 100, 1)})",
         ),
-        (
-            "success of the generator's own first",
-            f"{percent(top1['generator']['rate'])} ({span(top1['generator']['interval'], 100, 1)})",
-        ),
+        ("success of the generator's own first", f"{percent(own['value'])} ({span(own['interval'], 100, 1)})"),
         ("success of all generated grasps", percent(generated["success_rate"])),
         (
             "change of success by refinement guided by `em2`",
@@ -221,37 +220,28 @@ def labels(found: dict[str, Any]) -> str:
     )
 
 
+def evaluators(found: dict[str, Any]) -> str:
+    """The comparison's own tables, and its charts."""
+    parts = ["## Evaluators\n", f"`benchmarks/comparison.py`. {NOTES}"]
+    for source, section in found["sources"].items():
+        parts += [f"{title(source, section)}:\n", markdown_table(main_table(section))]
+        parts += [markdown_table(counts_table(section))] if source == "generated" else []
+    parts += [
+        markdown_table(cost_table(found["cost"])),
+        "![Success by place in the ranking](comparison/rank.png)\n",
+        "![Calibration](comparison/reliability.png)\n",
+        "![Success of the first grasp by category](comparison/categories.png)\n",
+    ]
+    return "\n".join(parts)
+
+
 def page() -> str:
-    em2, refine, meshes = read("em2"), read("refine"), read("meshes")
+    refine, meshes = read("refine"), read("meshes")
     kinematics, collect = read("kinematics"), read("collect")
     parts = [
         "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
         "bootstrap over scenes.\n",
-        f"## Evaluator\n\n`benchmarks/evaluator.py`; {em2['objects']} test objects.\n",
-        table(
-            ("grasps", "number", "scenes", "that hold", "accuracy", "AUROC", "interval"),
-            [
-                (
-                    name,
-                    part["grasps"],
-                    part["scenes"],
-                    percent(part["success_rate"]),
-                    percent(part["accuracy"]),
-                    f"{part['auroc']:.3f}",
-                    span(part["auroc_interval"]),
-                )
-                for name, part in (("generated", em2["generated"]), ("with simulated neighbours", em2["all"]))
-            ],
-        ),
-        f"The generator's own order reaches an AUROC of {em2['generated']['auroc_of_generator_order']:.3f}. "
-        "The first grasp of each scene holds:\n",
-        table(
-            ("first by", "holds", "interval"),
-            [
-                (name, percent(row["rate"]), span(row["interval"], 100, 1))
-                for name, row in em2["generated"]["top1"].items()
-            ],
-        ),
+        evaluators(read("comparison")),
         f"## Refinement\n\n`benchmarks/refine.py`; guided by `{refine['evaluator']}`, {refine['grasps']} grasps in "
         f"{refine['scenes']} scenes of test objects, of which {percent(refine['success_before'])} hold as generated; "
         "the same trials before and after.\n",

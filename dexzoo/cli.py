@@ -19,7 +19,11 @@ from rich.table import Table
 
 from dexzoo import plots, training
 from dexzoo.camera import Observation
+from dexzoo.comparison.compare import compare, load_models
+from dexzoo.comparison.inside import draw_inside
+from dexzoo.comparison.report import terminal_table, write
 from dexzoo.data.collect import ALL, Configuration, collect
+from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
 from dexzoo.data.writer import MANIFEST, read_manifest
 from dexzoo.generators import list_generators
@@ -151,6 +155,12 @@ def _parser() -> ArgumentParser:
     command.add_argument("--num_views", type=PositiveInt, default=4, help="views of each scene")
     command.add_argument("--trials", type=PositiveInt, default=1, help="more than 1: repetitions behind success_rate")
     command.add_argument("--images", action="store_true", help="keep the depth images; else rendered anew")
+
+    command = add("compare", "Compare models, the generator's own order (gm) and a coin on grasps of unseen objects.")
+    command.add_argument("models", nargs="*", help="names, files, folders or hf:// addresses; default: all shipped")
+    command.add_argument("--data", default="assets/grasps", help="grasp set: a folder, or an address such as s3://...")
+    command.add_argument("--split", choices=SPLITS, default="test", help="whose grasps")
+    command.add_argument("--out", type=Path, help="folder for comparison.md, comparison.json and pictures")
 
     command = add("demonstrate", "Make demonstrations for the Kopicki generator, and try each ten times in simulation.")
     command.add_argument("--preshapes", type=Path, help="YAML of preshapes to close; default: those of dlr2")
@@ -310,6 +320,16 @@ def _collect(options: Namespace) -> Result:
     return summary, _pairs("grasp set", {**counts, "skipped": sum(counts["skipped"].values()), "out": options.out})
 
 
+def _compare(options: Namespace) -> Result:
+    _check_folder(options.out)
+    models, data = load_models(options.models), GraspDataModule(options.data)
+    result = compare(models, data, options.split, options.seed)
+    if options.out is not None:
+        write(result, options.out)
+        draw_inside(models, data, options.split, options.out)
+    return result, terminal_table(result)
+
+
 def _demonstrate(options: Namespace) -> Result:
     _check_folder(options.out)
     if (options.recording is None) != (options.mesh is None) or (options.recording and options.preshapes):
@@ -370,6 +390,7 @@ _COMMANDS: dict[str, Callable[[Namespace], Result]] = {
     "refine": _refine,
     "verify": _verify,
     "collect": _collect,
+    "compare": _compare,
     "demonstrate": _demonstrate,
     "view": _view,
     "models": _models,

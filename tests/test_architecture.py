@@ -22,7 +22,7 @@ LAYERS = [
     {"models"},
     {"refinement", "verification"},
     {"data"},
-    {"planning", "training", "compare", "plots", "viewer"},
+    {"planning", "training", "comparison", "plots", "viewer"},
     {"cli"},
     {"__main__"},
 ]

@@ -9,12 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import synthetic
 import torch
 import trimesh
 from safetensors.torch import save_file
 
 from dexzoo import cli, planning
 from dexzoo.camera import Observation
+from dexzoo.comparison import scores
 from dexzoo.data import collect as collecting
 from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import GRASP_TYPES, Grasps
@@ -434,3 +436,50 @@ def test_failures_of_the_machine_are_status_1(
 
     monkeypatch.setattr(cli, "plan", stopped)
     assert run("plan", *observed) == (1, "", "dexzoo: stopped\n")
+
+
+# compare
+
+
+def test_compare_tells_which_model_to_use(
+    run: Run, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scores, "NUM_TIMED", 8)  # a thousand take EM2 seconds
+    grasps, out = synthetic.write(tmp_path / "grasps", num_grasps=8), tmp_path / "new" / "out"
+    status, text, err = run("compare", weights, "--data", grasps, "--out", out)
+    assert (status, err) == (0, "")
+    assert "8 generated grasps of 1 objects in 1 scenes" in " ".join(text.split())
+    for name in ("accuracy", "AUROC", "calibration", "top-1", weights.stem, "gm", "coin"):
+        assert name in text
+    assert max(len(line) for line in text.splitlines()) <= 80
+    written = {path.name for path in out.iterdir()}
+    assert written == {
+        "comparison.md",
+        "comparison.json",
+        "rank.png",
+        "reliability.png",
+        "categories.png",
+        "em2_maps.png",
+        "em2_grasps.png",
+    }
+    status, text, err = run("compare", weights, "--data", grasps, "--json")
+    assert (status, err) == (0, "")
+    again, first = json.loads(text), json.loads((out / "comparison.json").read_text())
+    assert again["sources"] == first["sources"]
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["emm2"], "did you mean em2"),
+        (["nosuch.safetensors"], "do not exist"),
+        (["em2", "--data", "nosuch"], "grasp set nosuch"),
+        (["em2", "--split", "val"], "--split"),
+        (["em2", "--out", "pyproject.toml"], "--out pyproject.toml is a file"),
+    ],
+)
+def test_wrong_comparisons_are_told_in_one_line(run: Run, args: list[str], message: str) -> None:
+    status, out, err = run("compare", *args)
+    assert (status, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1

@@ -18,8 +18,8 @@ from dexzoo.sim.shapes import make_object
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
-# These make a grasp set, train or serve until stopped; tests of their own run them small.
-ELSEWHERE = ("collect", "fit", "test", "view")
+# These make or go through a grasp set, train or serve until stopped; tests of their own run them small.
+ELSEWHERE = ("collect", "compare", "fit", "test", "view")
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from dexzoo.camera import Camera, Observation, look_at
-from dexzoo.generators.demonstration import load_demonstrations
+from dexzoo.generators import list_generators, make_generator
+from dexzoo.generators.demonstration import SHIPPED, load_demonstrations
 from dexzoo.generators.density import Grips
-from dexzoo.generators.kopicki import KopickiGenerator, obstacles
+from dexzoo.generators.kopicki import KopickiGenerator, Way, obstacles
 from dexzoo.generators.search import anneal, climb
 from dexzoo.grasp import GRIP, Grasps
 from dexzoo.hand import Hand
@@ -83,6 +84,37 @@ def test_the_likelihood_of_what_was_generated_is_that_of_the_density_less_costs(
     value = density.log_density(grasps.to_frame("world", can_view.T_world_camera))
     assert grasps.log_likelihood is not None
     assert (value >= grasps.log_likelihood - 0.5).all()
+
+
+def test_fingers_that_stop_short_of_the_surface_or_in_it_cost_the_thumb_most(hand: Hand) -> None:
+    """The demonstrated grip on the demonstrated surface, moved off it by what the cost should then tell."""
+    shown = [one for one in load_demonstrations() if one.object == "can_00"]
+    generator = KopickiGenerator(shown, **CALL)  # type: ignore[arg-type]
+    for demo, one in enumerate(shown):
+        way = Way(shown, generator.models, hand, one.surface.points, torch.zeros(0, 3), torch.Generator())
+        wrist, joints = one.grasp.wrist_pose[:, GRIP], hand.reduce(one.grasp.joints[:, GRIP])
+        at = torch.tensor([demo])
+        assert way.gap_cost(Grips(at, wrist, joints)) < 1.5, "the fingers touch, but for the spacing of the points"
+        opened = {}
+        for finger in ("thumb", "index"):
+            posture = joints.clone()
+            posture[:, hand.freedoms.index(f"{finger}_mcp")] -= 0.3
+            opened[finger] = float(way.gap_cost(Grips(at, wrist, posture)))
+        assert opened["thumb"] > 1.5 * opened["index"] > 1.5
+        away = wrist.clone()
+        away[:, 2, 3] += 0.3
+        assert way.gap_cost(Grips(at, away, joints)) > 100
+
+
+def test_generators_by_name_and_by_folder() -> None:
+    assert list_generators()[0] == "kopicki"
+    assert make_generator("kopicki") is make_generator("kopicki"), "made once"
+    named, folder = make_generator("kopicki"), make_generator(str(SHIPPED))
+    assert isinstance(named, KopickiGenerator)
+    assert isinstance(folder, KopickiGenerator)
+    assert [d.grasp_type for d in folder.demonstrations] == [d.grasp_type for d in named.demonstrations]
+    with pytest.raises(ValueError, match="generator 'magic' is unknown; use one of kopicki, heuristic, or a folder"):
+        make_generator("magic")
 
 
 def test_the_support_of_an_object_is_an_obstacle() -> None:

@@ -1,0 +1,99 @@
+"""Compare evaluative models on the grasps of unseen objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from dexzoo.comparison.figures import NUM_DRAWS, against, describe, draw_scenes
+from dexzoo.comparison.scores import (
+    COIN,
+    GM,
+    Labels,
+    Scores,
+    coin_scores,
+    first_image,
+    likelihood_scores,
+    measure,
+    model_scores,
+    read_labels,
+)
+from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.data.schema import SOURCES, VERSION
+from dexzoo.models.evaluator import GraspEvaluator
+from dexzoo.models.zoo import list_models, load, shipped_card
+
+GENERATED = SOURCES[0]
+
+
+def load_models(models: Sequence[str]) -> dict[str, GraspEvaluator]:
+    """Models by the names of their rows: the last part of a path, or the whole where that is taken.
+
+    models: names, files, folders or addresses, as `dexzoo.load` takes them; one given twice is loaded once, and if none
+    is given, all that come with weights are.
+    """
+    models = list(dict.fromkeys(models)) or [name for name in list_models() if shipped_card(name)]
+    short = [Path(model).stem for model in models]
+    taken = [*short, GM, COIN]
+    names = [name if taken.count(name) == 1 else model for name, model in zip(short, models, strict=True)]
+    return {name: load(model) for name, model in zip(names, models, strict=True)}
+
+
+def compare(
+    models: Mapping[str, GraspEvaluator], data: GraspDataModule, split: str = "test", seed: int = 0
+) -> dict[str, Any]:
+    """All figures of some models, of the generator's likelihood (gm) and of a coin on one split of a grasp set.
+
+    models: by the names of their rows. seed: of the coin and of the bootstrap's draws. The same call gives the same
+    result, but for the times in `cost`.
+
+    Returns plain values, ready for JSON: split, seed, num_draws; data (version and checksum of the set); sources, for
+    generated grasps and, where the split has some, for perturbed and refined ones: how many grasps, objects and scenes,
+    the success rate, and in `rows`, by name, what `figures.describe` and `figures.against` say; cost, by model. Ranks
+    are within the grasps of one source in one scene, each seen in the view that the set pairs it with. There is no row
+    gm where the set has no likelihoods; its threshold is the most accurate one for the generated grasps of validation.
+
+    Raises FileNotFoundError or ValueError for a set that cannot be had, or a split without generated grasps.
+    """
+    labels = {source: found for source in SOURCES if (found := read_labels(data, split, source))}
+    if GENERATED not in labels:
+        raise ValueError(f"grasp set {data.folder} has no generated grasps in its {split} split; collect more objects")
+    rows: dict[str, dict[str, Scores]] = {source: {} for source in labels}
+    cost = {}
+    image = first_image(data, split)
+    for name, model in models.items():
+        for source in labels:
+            dataset = data.dataset(split, model, [source])
+            rows[source][name] = model_scores(model, dataset, f"{name} on {source} grasps")
+            if source == GENERATED:
+                cost[name] = asdict(measure(model, image, dataset.grasps))
+    validation = read_labels(data, "validation", GENERATED)
+    return {
+        "split": split,
+        "seed": seed,
+        "num_draws": NUM_DRAWS,
+        "data": {"version": VERSION, "sha256": data.source.sha256},
+        "sources": {source: _section(labels[source], rows[source], validation, seed) for source in labels},
+        "cost": cost,
+    }
+
+
+def _section(labels: Labels, rows: dict[str, Scores], validation: Labels | None, seed: int) -> dict[str, Any]:
+    """The figures of all rows on the grasps of one source."""
+    likelihood = likelihood_scores(labels, validation)
+    reference = {} if likelihood is None else {GM: likelihood}
+    rows = {**rows, **reference, COIN: coin_scores(labels, seed)}
+    draws = draw_scenes(labels.num_scenes, seed)
+    return {
+        "grasps": len(labels.success),
+        "objects": len(set(labels.objects)),
+        "scenes": labels.num_scenes,
+        "success_rate": float(labels.success.mean()),
+        "rows": {
+            name: describe(labels, scores, draws)
+            | ({"against_gm": against(labels, scores, likelihood)} if likelihood is not None and name != GM else {})
+            for name, scores in rows.items()
+        },
+    }

@@ -1,0 +1,142 @@
+"""What a model makes of an image and of grasps: feature maps (thesis, Fig. 3.5) and principal components (Fig. 3.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from torch import Tensor, nn
+
+from dexzoo.camera import colourise
+from dexzoo.comparison.charts import save
+from dexzoo.comparison.scores import encoded_views, first_image
+from dexzoo.data.datamodule import GraspDataModule, GraspDataset
+from dexzoo.grasp import GRASP_TYPES, TYPE
+from dexzoo.models.encoders import GraspVector
+from dexzoo.models.evaluator import GraspEvaluator
+
+NUM_GRASPS = 1000
+BRANCH = "hand_branch"
+"""The name of the module, in models that have one, that sees the grasp alone."""
+_COLUMNS = 5
+
+
+def draw_inside(models: Mapping[str, GraspEvaluator], data: GraspDataModule, split: str, folder: Path) -> None:
+    """Write NAME_maps.png, for models that have feature maps, and NAME_grasps.png into a folder."""
+    image = first_image(data, split)
+    for name, model in models.items():
+        stem = name.strip("/").replace("/", "_")
+        maps = feature_maps(model, image)
+        if maps is not None:
+            save(maps_picture(image, maps), folder / f"{stem}_maps.png")
+        dataset = data.dataset(split, model)
+        rows, features = grasp_features(model, dataset)
+        where = "after the hand branch" if BRANCH in dict(model.named_modules()) else "before the last layer"
+        picture = components_picture(dataset.grasps[rows], features, dataset.success[rows] > 0.5, where)
+        save(picture, folder / f"{stem}_grasps.png")
+
+
+@torch.no_grad()
+def feature_maps(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"]) -> Float[Tensor, "channel h w"] | None:
+    """The last feature maps that a module of the model gives while it encodes an image; None where none does."""
+    with _recorded(list(model.modules())) as outputs:
+        model.encode(image.to(model.device))
+    maps = [output for output in outputs if output.ndim == 4 and min(output.shape[2:]) > 1]
+    return maps[-1][0].float().cpu() if maps else None
+
+
+@torch.no_grad()
+def grasp_features(model: GraspEvaluator, dataset: GraspDataset) -> tuple[Tensor, Float[Tensor, "grasp feature"]]:
+    """What a model makes of about a thousand grasps: their rows, and the features.
+
+    Features are the output of the module `hand_branch`, or, in a model without, what its last linear layer is given,
+    where grasp and image are already joined.
+    """
+    branch = dict(model.named_modules()).get(BRANCH)
+    linear: list[nn.Module] = [module for module in model.modules() if isinstance(module, nn.Linear)]
+    rows, features = [], []
+    step = max(1, len(dataset) // NUM_GRASPS)
+    with _recorded([branch] if branch else linear, inputs=branch is None) as recorded:
+        for i, (part, scene) in enumerate(encoded_views(model, dataset)):
+            if i % step == 0:
+                recorded.clear()
+                model.logit(scene, dataset.grasps[part][None].to(model.device))
+                rows.append(part)
+                features.append(recorded[-1].float().cpu().reshape(len(part), -1))
+    return torch.cat(rows), torch.cat(features)
+
+
+def maps_picture(image: Float[Tensor, "1 2 224 224"], maps: Float[Tensor, "channel h w"]) -> Figure:
+    """The image's three channels, and the maps that vary most over it."""
+    channels = dict(zip(("depth", "mean curvature", "Gaussian curvature"), colourise(image[:, 0])[0], strict=True))
+    shown = maps.flatten(1).std(1).argsort(descending=True, stable=True)[: 4 * _COLUMNS - len(channels)]
+    panels = channels | {f"channel {int(i)}": maps[i] for i in shown}
+    figure = Figure((2 * _COLUMNS, 8.6), layout="constrained")
+    for place, (title, panel) in enumerate(panels.items(), 1):
+        axes = figure.add_subplot(4, _COLUMNS, place)
+        seen = panel[image[0, 0] > 0] if title in channels else panel
+        low, high = np.percentile(seen.numpy(), [1, 99])
+        axes.imshow(
+            panel.numpy(), cmap="gray" if title in channels else "viridis", vmin=low, vmax=max(high, low + 1e-9)
+        )
+        axes.set_title(title, fontsize=9)
+        axes.set_axis_off()
+    return figure
+
+
+def components_picture(
+    grasps: Float[Tensor, "grasp 10 28"], features: Float[Tensor, "grasp feature"], held: Tensor, where: str
+) -> Figure:
+    """First two principal components of grasps as 280 numbers and as a model's features, by outcome and by type."""
+    vectors = GraspVector.flatten(grasps)
+    spaces = {"as 280 numbers": principal_components(vectors), where: principal_components(features)}
+    kind = grasps[:, 0, TYPE].round().long()
+    colourings = (
+        {name: held == value for name, value in (("fails", False), ("holds", True))},
+        {GRASP_TYPES[int(value)]: kind == value for value in kind.unique()},
+    )
+    figure = Figure((9.5, 8), layout="constrained")
+    for i, colouring in enumerate(colourings):
+        for j, (title, points) in enumerate(spaces.items()):
+            axes = figure.add_subplot(2, 2, 1 + 2 * i + j)
+            for label, chosen in colouring.items():
+                x, y = points[chosen].numpy().T
+                axes.scatter(x, y, s=7, alpha=0.6, linewidth=0, label=label)
+            axes.set(xticks=[], yticks=[], title=title)
+            if j:
+                axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), markerscale=2)
+    return figure
+
+
+def principal_components(values: Float[Tensor, "row column"]) -> Float[Tensor, "row 2"]:
+    """The first two principal components of standardised columns; a column that does not vary counts for nothing."""
+    values = values.double()
+    spread = values.std(0)
+    values = (values - values.mean(0)) / torch.where(spread > 1e-6, spread, torch.inf)
+    # by the rows' inner products: there are fewer rows than features
+    power, vectors = torch.linalg.eigh(values @ values.mT)
+    first = vectors[:, -2:].flip(1) * power[-2:].flip(0).clamp_min(0).sqrt()
+    turned: Tensor = first * torch.where(first.sum(0) < 0, -1.0, 1.0)  # the sign is the solver's whim
+    return turned
+
+
+@contextmanager
+def _recorded(modules: list[nn.Module], inputs: bool = False) -> Iterator[list[Tensor]]:
+    """The outputs, or the first inputs, of some modules in the order in which they are called."""
+    found: list[Tensor] = []
+
+    def keep(_: nn.Module, given: tuple[object, ...], output: object) -> None:
+        parts = given[:1] if inputs else output if isinstance(output, tuple) else (output,)
+        found.extend(part for part in parts if isinstance(part, Tensor))
+
+    handles = [module.register_forward_hook(keep) for module in modules]
+    try:
+        yield found
+    finally:
+        for handle in handles:
+            handle.remove()

@@ -1,0 +1,148 @@
+"""A comparison for people: tables in Markdown, and the folder with everything."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich import box
+from rich.table import Table
+
+from dexzoo.comparison.charts import draw_charts
+
+Cells = list[list[str]]
+"""A table: its head, then its rows."""
+
+
+class _Column(NamedTuple):
+    heading: str
+    scale: float
+    digits: int
+    higher_is_better: bool = True
+    with_interval: bool = False
+
+
+_COLUMNS = {
+    "accuracy": _Column("accuracy", 100, 1, with_interval=True),
+    "balanced_accuracy": _Column("balanced", 100, 1),
+    "auroc": _Column("AUROC", 1, 3, with_interval=True),
+    "scene_auroc": _Column("in scenes", 1, 3),
+    "average_precision": _Column("AP", 1, 3),
+    "brier": _Column("Brier", 1, 3, higher_is_better=False),
+    "calibration_error": _Column("calibration", 1, 3, higher_is_better=False),
+    "top1": _Column("top-1", 100, 1, with_interval=True),
+    "top5": _Column("top-5", 100, 1),
+}
+_BRIEF = ("accuracy", "auroc", "scene_auroc", "calibration_error", "top1", "top5")
+_COUNTS = {"tp": "tp", "fp": "fp", "tn": "tn", "fn": "fn"}
+_CROSS = {"both": "both hold", "only_this": "only this", "only_gm": "only gm", "neither": "neither"}
+_COST = {
+    "parameters": "parameters",
+    "megabytes": "MB",
+    "milliseconds_per_view": "ms a view",
+    "milliseconds_per_1000_grasps": "ms for 1,000 grasps",
+    "threads": "threads",
+}
+NOTES = """\
+Accuracy, balanced accuracy (the mean of the rates at which successes and failures are recognised) and success of the
+first and of the five first grasps of each scene in %; AUROC over all grasps and, averaged, within scenes; average
+precision; Brier score and expected calibration error, the lower the better. 95 % intervals are bootstrap over scenes.
+p: McNemar's exact test of top-1 against gm, the generator's own order, whose threshold was chosen on validation. The
+best of each column is bold.
+"""
+
+
+def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
+    """The figures of one source, the best of each column between asterisks.
+
+    brief: only those that fit into a terminal, without intervals.
+    """
+    rows: dict[str, Any] = section["rows"]
+    columns = {name: column for name, column in _COLUMNS.items() if not brief or name in _BRIEF}
+    table = [["", *(column.heading for column in columns.values()), "p"]]
+    best = {name: _best([row["figures"].get(name) for row in rows.values()], name) for name in columns}
+    for label, row in rows.items():
+        cells = []
+        for name, column in columns.items():
+            figure = row["figures"].get(name, {"value": None})
+            cell = _number(figure["value"], column)
+            if figure["value"] is not None and figure["value"] == best[name]:
+                cell = f"**{cell}**"
+            if column.with_interval and not brief and figure.get("interval"):
+                cell += " ({} to {})".format(*(_number(end, column) for end in figure["interval"]))
+            cells.append(cell)
+        table.append([label, *cells, _p(row.get("against_gm", {}).get("top1"))])
+    return table
+
+
+def terminal_table(result: dict[str, Any]) -> Table:
+    """The main table of the first source, the generated grasps, for a terminal of 80 columns."""
+    source, section = next(iter(result["sources"].items()))
+    head, *rows = main_table(section, brief=True)
+    shown = Table(*head, title=title(source, section), box=box.SIMPLE)
+    for row in rows:
+        shown.add_row(*(re.sub(r"\*\*(.*?)\*\*", r"[bold]\1[/bold]", cell) for cell in row))
+    return shown
+
+
+def counts_table(section: dict[str, Any]) -> Cells:
+    """True and false positives and negatives (thesis, Table 3.3), and the cross table of top-1 with gm (Table 3.4)."""
+    table = [["", *_COUNTS.values(), *_CROSS.values()]]
+    for label, row in section["rows"].items():
+        counts, cross = row["counts"] or {}, row.get("against_gm", {}).get("top1", {})
+        cells = [*(counts.get(name) for name in _COUNTS), *(cross.get(name) for name in _CROSS)]
+        table.append([label, *("" if cell is None else f"{cell:,}" for cell in cells)])
+    return table
+
+
+def cost_table(cost: dict[str, dict[str, Any]]) -> Cells:
+    """Size and speed of the models."""
+    return [["", *_COST.values()], *([label, *(f"{row[name]:,}" for name in _COST)] for label, row in cost.items())]
+
+
+def title(source: str, section: dict[str, Any]) -> str:
+    """What a table is about."""
+    return (
+        f"{section['grasps']:,} {source} grasps of {section['objects']} objects in {section['scenes']:,} scenes, "
+        f"{100 * section['success_rate']:.1f} % hold"
+    )
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The whole comparison: for each source the main table and the counts, then the cost."""
+    parts = [f"# Comparison on the {result['split']} split\n", NOTES]
+    for source, section in result["sources"].items():
+        parts += [f"## {title(source, section)}\n", table(main_table(section)), table(counts_table(section))]
+    parts += ["## Cost\n", table(cost_table(result["cost"]))]
+    return "\n".join(parts)
+
+
+def table(cells: Cells) -> str:
+    """Cells in Markdown."""
+    lines = [f"| {' | '.join(row)} |" for row in cells]
+    return "\n".join([lines[0], "|" + "---|" * len(cells[0]), *lines[1:]]) + "\n"
+
+
+def write(result: dict[str, Any], folder: Path) -> None:
+    """Write comparison.md, comparison.json and the charts into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "comparison.md").write_text(markdown(result))
+    (folder / "comparison.json").write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
+    draw_charts(result, folder)
+
+
+def _best(figures: list[dict[str, Any] | None], name: str) -> float | None:
+    values = [figure["value"] for figure in figures if figure and figure["value"] is not None]
+    return (max if _COLUMNS[name].higher_is_better else min)(values, default=None)
+
+
+def _number(value: float | None, column: _Column) -> str:
+    return "" if value is None else f"{column.scale * value:.{column.digits}f}"
+
+
+def _p(cross: dict[str, Any] | None) -> str:
+    if not cross:
+        return ""
+    return "< 0.0001" if cross["p"] < 1e-4 else f"{cross['p']:.4f}"

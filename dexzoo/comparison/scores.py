@@ -1,0 +1,196 @@
+"""The rows of a comparison: how evaluators, the generator's likelihood and a coin score the grasps of a set."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from rich.progress import track
+from torch import Tensor
+
+from dexzoo.data.datamodule import GraspDataModule, GraspDataset
+from dexzoo.data.schema import SPLITS
+from dexzoo.models.evaluator import CHUNK, GraspEvaluator, Scene
+
+GM, COIN = "gm", "coin"
+"""The rows that every comparison has: the generative model, ranking by its own likelihood, and chance."""
+NUM_TIMED = 1000
+_REPEATS = 3
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Grasps of one source, and what became of them.
+
+    success: (grasp,) whether each held. scene: (grasp,) from 0, without gaps. objects, category: (scene,) names.
+    log_likelihood: (grasp,) the generator's, nan where it is not known.
+    """
+
+    success: NDArray[np.bool_]
+    scene: NDArray[np.int64]
+    objects: NDArray[Any]
+    category: NDArray[Any]
+    log_likelihood: NDArray[np.float32]
+
+    @property
+    def num_scenes(self) -> int:
+        """How many scenes there are."""
+        return len(self.category)
+
+    def __getitem__(self, scenes: NDArray[np.int64]) -> Labels:
+        """The grasps of some scenes, which are numbered anew."""
+        rows = np.isin(self.scene, scenes)
+        scene = np.unique(self.scene[rows], return_inverse=True)[1]
+        return Labels(self.success[rows], scene, self.objects[scenes], self.category[scenes], self.log_likelihood[rows])
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What one row says of the grasps.
+
+    score: (grasp,) what ranks them, best highest. probability: (grasp,) of success; None where it gives none.
+    threshold: the probability, or else the score, above which a grasp is predicted to hold; None if none was chosen.
+    """
+
+    score: NDArray[np.float32]
+    threshold: float | None
+    probability: NDArray[np.float32] | None
+
+    @property
+    def predicted(self) -> NDArray[np.bool_] | None:
+        """(grasp,) whether each is predicted to hold."""
+        value = self.score if self.probability is None else self.probability
+        return None if self.threshold is None else value > self.threshold
+
+    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Scores:
+        """The scores of some grasps."""
+        probability = None if self.probability is None else self.probability[rows]
+        return Scores(self.score[rows], self.threshold, probability)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a model takes.
+
+    parameters: those trained; the frozen trunk, shared by models, has its own. megabytes: of its weights as `save`
+    writes them, without the trunk. milliseconds_per_view, milliseconds_per_1000_grasps: best of three on `threads`
+    threads; the view is encoded by the trunk and all, the grasps are scored on one view.
+    """
+
+    parameters: int
+    megabytes: float
+    milliseconds_per_view: float
+    milliseconds_per_1000_grasps: float
+    threads: int
+
+
+def read_labels(data: GraspDataModule, split: str, source: str) -> Labels | None:
+    """The grasps of a split from one source, in the order of `data.dataset`; None where there are none."""
+    grasp_set = data.source
+    rows = np.flatnonzero((grasp_set.grasp_split == SPLITS.index(split)) & (grasp_set.source == source))
+    if not len(rows):
+        return None
+    shown, scene = np.unique(grasp_set.grasp_scene[rows], return_inverse=True)
+    objects, category = (np.array(grasp_set.scenes[name].to_pylist(), str)[shown] for name in ("object", "category"))
+    likelihood = np.asarray(grasp_set.grasps["log_likelihood"].to_numpy(), np.float32)
+    return Labels(grasp_set.success[rows], scene, objects, category, likelihood[rows])
+
+
+def first_image(data: GraspDataModule, split: str) -> Float[Tensor, "1 2 224 224"]:
+    """What evaluators see of the first view of a split."""
+    row = int(data.source.grasp_view[data.source.grasp_split == SPLITS.index(split)].min())
+    return data.source.images([row])[torch.tensor([0])]
+
+
+def encoded_views(model: GraspEvaluator, dataset: GraspDataset) -> Iterator[tuple[Tensor, Scene]]:
+    """For each view of a dataset the rows of its grasps, and what the model keeps of it, encoded once."""
+    order = dataset.view.argsort(stable=True)
+    views, count = dataset.view[order].unique_consecutive(return_counts=True)
+    for view, rows in zip(views.split(1), order.split(count.tolist()), strict=True):
+        if isinstance(dataset.views, dict):
+            yield rows, {name: value[view].to(model.device) for name, value in dataset.views.items()}
+        else:
+            yield rows, model.encode(dataset.views[view].to(model.device))
+
+
+@torch.no_grad()
+def model_scores(model: GraspEvaluator, dataset: GraspDataset, title: str) -> Scores:
+    """Log-odds and probabilities of a model on each grasp, seen in the view that the set pairs it with.
+
+    title: of the progress bar. ValueError for a model that gives nan.
+    """
+    logit = torch.zeros(len(dataset))
+    views = encoded_views(model, dataset)
+    num_views = len(dataset.view.unique())
+    for rows, scene in track(views, title, num_views, transient=True, disable=not sys.stderr.isatty()):
+        logit[rows] = model.logit(scene, dataset.grasps[rows][None].to(model.device))[0].float().cpu()
+    if wrong := int((~logit.isfinite()).sum()):
+        raise ValueError(f"{title}: {wrong} of {len(logit)} scores are nan or infinite; the weights are of no use")
+    return Scores(logit.numpy(), 0.5, logit.sigmoid().numpy())
+
+
+def likelihood_scores(labels: Labels, validation: Labels | None) -> Scores | None:
+    """The generator's log-likelihood, with the threshold that is most accurate on validation grasps; None if unknown.
+
+    A likelihood is no probability of success, so it has no calibration.
+    """
+    if np.isnan(labels.log_likelihood).any():
+        return None
+    threshold = None
+    if validation is not None and not np.isnan(validation.log_likelihood).any():
+        threshold = best_threshold(validation.log_likelihood, validation.success)
+    return Scores(labels.log_likelihood, threshold, None)
+
+
+def coin_scores(labels: Labels, seed: int) -> Scores:
+    """A probability drawn for each grasp, uniformly."""
+    probability = np.random.default_rng(seed).random(len(labels.success), np.float32)
+    return Scores(probability, 0.5, probability)
+
+
+def best_threshold(score: NDArray[np.float32], success: NDArray[np.bool_]) -> float:
+    """The threshold above which calling a grasp a success is right most often; the lowest of equals."""
+    value, place = np.unique(score, return_inverse=True)
+    held, failed = (np.bincount(place, kind, minlength=len(value)) for kind in (success, ~success))
+    # a threshold below all values gets every success right; each value that it rises to trades successes for failures
+    right = held.sum() + np.concatenate(([0], np.cumsum(failed - held)))
+    below = np.nextafter(value[0], np.float32(-np.inf))
+    return float(np.append(below, value)[right.argmax()])
+
+
+@torch.no_grad()
+def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: Float[Tensor, "grasp 10 28"]) -> Cost:
+    """Size of a model, and its speed on one view and some grasps, which are repeated up to 1,000."""
+    image = image.to(model.device)
+    grasps = grasps[torch.arange(NUM_TIMED) % len(grasps)].to(model.device)
+    scene = model.encode(image)
+    view = _best_time(lambda: model.encode(image))
+    scoring = _best_time(lambda: [model.logit(scene, part[None]) for part in grasps.split(CHUNK)])
+    with tempfile.TemporaryDirectory() as folder:
+        size = model.save(Path(folder)).stat().st_size
+    return Cost(
+        sum(parameter.numel() for parameter in model.parameters()),
+        round(size / 1e6, 1),
+        round(1000 * view, 1),
+        round(1000 * scoring, 1),
+        torch.get_num_threads(),
+    )
+
+
+def _best_time(work: Callable[[], object]) -> float:
+    """Seconds on the clock, the least of a few runs."""
+    times = []
+    for _ in range(_REPEATS):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return min(times)

@@ -1,0 +1,212 @@
+"""Comparisons of a grasp set, with evaluators of which the outcome is known."""
+
+import json
+from pathlib import Path
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pytest
+import synthetic
+import torch
+from sklearn.decomposition import PCA
+from torch import Tensor, nn
+
+from dexzoo.comparison.compare import compare, load_models
+from dexzoo.comparison.inside import draw_inside, feature_maps, grasp_features, principal_components
+from dexzoo.comparison.report import main_table, markdown, write
+from dexzoo.comparison.scores import encoded_views, model_scores
+from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.data.schema import SPLITS
+from dexzoo.grasp import JOINTS, SQUEEZE, Grasps
+from dexzoo.hand import default_hand
+from dexzoo.models.em2 import EM2
+from dexzoo.models.evaluator import GraspEvaluator, Scene
+
+NUM_SCENES = len(synthetic.SPLIT_OF)
+
+
+class Closure(GraspEvaluator):
+    """Knows the rule of the synthetic set: a grasp closed enough holds. With a negative gain it is always wrong."""
+
+    architecture: ClassVar[str] = "closure"
+
+    def __init__(self, gain: float = 50.0) -> None:
+        super().__init__()
+        self.gain = gain
+        self.head = nn.Linear(15, 1)
+        nn.init.constant_(self.head.weight, gain / 15)
+        nn.init.constant_(self.head.bias, -gain * synthetic.CLOSED)
+
+    def encode(self, images: Tensor) -> Scene:
+        return {"nothing": images.new_zeros(len(images), 1)}
+
+    def logit(self, scene: Scene, grasps: Tensor) -> Tensor:
+        hand = default_hand()
+        low, high = hand.reduce(hand.lower), hand.reduce(hand.upper)
+        share = (hand.reduce(grasps[:, :, SQUEEZE, JOINTS]) - low) / (high - low)
+        return self.head(share)[..., 0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthetic.write(tmp_path_factory.mktemp("grasps"), num_grasps=40)
+
+
+@pytest.fixture
+def data(folder: Path, tmp_path: Path) -> GraspDataModule:
+    """The synthetic set with five scenes for testing and one for validation, and every fourth grasp perturbed."""
+    module = GraspDataModule(str(folder), cache=str(tmp_path / "cache"))
+    source = module.source
+    source.grasp_split[:] = np.where(source.grasp_scene == 4, SPLITS.index("validation"), SPLITS.index("test"))
+    source.source[::4] = "perturbed"
+    place = source.grasps.schema.get_field_index("log_likelihood")
+    likelihood = [None if kind == "perturbed" else x for kind, x in zip(source.source, np.sin(range(240)), strict=True)]
+    source.grasps = source.grasps.set_column(place, "log_likelihood", pa.array(likelihood, pa.float32()))
+    return module
+
+
+@pytest.fixture
+def models() -> dict[str, GraspEvaluator]:
+    return {"right": Closure(), "wrong": Closure(-50.0)}
+
+
+def without_times(result: dict[str, Any]) -> str:
+    return json.dumps({name: value for name, value in result.items() if name != "cost"})
+
+
+def test_who_knows_is_told_from_who_errs(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
+    result = compare(models, data)
+    generated, perturbed = result["sources"]["generated"], result["sources"]["perturbed"]
+    assert list(result["sources"]) == ["generated", "perturbed"]
+    assert list(generated["rows"]) == ["right", "wrong", "gm", "coin"]
+    assert list(perturbed["rows"]) == ["right", "wrong", "coin"]  # nobody knows the likelihood of a perturbed grasp
+    assert (generated["scenes"], generated["objects"], generated["grasps"]) == (5, 5, 150)
+    right, wrong = (generated["rows"][name]["figures"] for name in models)
+    for name in ("accuracy", "balanced_accuracy", "auroc", "scene_auroc", "average_precision"):
+        assert right[name]["value"] == pytest.approx(1), name
+    for name in ("accuracy", "auroc", "scene_auroc", "top1"):
+        assert wrong[name]["value"] == pytest.approx(0), name
+    assert right["top1"] == {"value": 1, "interval": [1, 1]}
+    assert wrong["brier"]["value"] > 0.5 > 0.1 > right["brier"]["value"]
+    against = generated["rows"]["right"]["against_gm"]["top1"]
+    assert against["only_gm"] == against["neither"] == 0
+    assert against["both"] + against["only_this"] == 5
+
+
+def test_the_threshold_of_gm_comes_from_validation(data: GraspDataModule) -> None:
+    rows = (data.source.grasp_scene == 4) & (data.source.source == "generated")
+    held = data.source.success[rows]
+    likelihood = np.array(data.source.grasps["log_likelihood"].to_pylist(), float)[rows]
+    gm = compare({}, data)["sources"]["generated"]["rows"]["gm"]
+    best = max(((likelihood > x) == held).mean() for x in [-2, *likelihood])
+    assert ((likelihood > gm["threshold"]) == held).mean() == best
+
+
+def test_the_same_call_gives_the_same_result(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
+    first, again, other = (without_times(compare(models, data, seed=seed)) for seed in (0, 0, 1))
+    assert first == again
+    assert first != other
+
+
+def test_each_grasp_is_scored_in_its_own_view(data: GraspDataModule) -> None:
+    torch.manual_seed(0)
+    model = EM2(width=16, gain=1.5)  # a gain that lets grasps come through an untrained network
+    source = data.source
+    model.fit_statistics(source.images([0, 1])[torch.arange(2)], data.waypoints)
+    model.eval()
+    scores = model_scores(model, data.dataset("validation", model), "scoring")
+    rows = np.flatnonzero((source.grasp_scene == 4) & (source.source == "generated"))
+    assert len(np.unique(source.grasp_view[rows])) == 2
+    for row, probability in zip(rows[::5], scores.probability[::5], strict=True):
+        grasp = Grasps(source.world_grasps.waypoints[[row]], "world")
+        expected = model.score(source.observation(int(source.grasp_view[row])), grasp)
+        assert probability == pytest.approx(float(expected), abs=2e-3)  # views are cached in half precision
+    assert np.ptp(scores.probability) > 0.02
+
+
+def test_views_are_encoded_once_each(data: GraspDataModule, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = Closure()
+    calls: list[int] = []
+    encode = model.encode
+    monkeypatch.setattr(model, "encode", lambda images: calls.append(len(images)) or encode(images))
+    dataset = data.dataset("test", model)
+    rows = torch.cat([part for part, _ in encoded_views(model, dataset)])
+    assert calls == [1] * 10
+    assert sorted(rows.tolist()) == list(range(len(dataset)))
+
+
+def test_scores_that_are_no_numbers_are_refused(data: GraspDataModule) -> None:
+    with pytest.raises(ValueError, match="broken on generated grasps: 150 of 150 scores are nan"):
+        compare({"broken": Closure(float("nan"))}, data)
+
+
+def test_a_split_without_generated_grasps_is_refused(data: GraspDataModule) -> None:
+    with pytest.raises(ValueError, match="no generated grasps in its train split"):
+        compare({}, data, "train")
+
+
+def test_models_are_named_shortly_where_that_is_clear(tmp_path: Path) -> None:
+    files = [EM2(width=16).save(tmp_path / name) for name in ("a", "b", "gm")]
+    assert list(load_models([str(tmp_path / "a"), str(tmp_path / "b"), str(tmp_path / "a")])) == ["a", "b"]
+    assert list(load_models([str(path) for path in files])) == [str(path) for path in files]
+    assert list(load_models([str(tmp_path / "gm")])) == [str(tmp_path / "gm")]
+    assert "em2" in load_models([])
+
+
+def test_the_folder_holds_tables_numbers_and_pictures(
+    data: GraspDataModule, models: dict[str, GraspEvaluator], tmp_path: Path
+) -> None:
+    result = compare(models, data)
+    write(result, tmp_path)
+    assert json.loads((tmp_path / "comparison.json").read_text()) == result
+    assert (tmp_path / "comparison.md").read_text() == markdown(result)
+    for name in ("rank", "reliability", "categories"):
+        picture = cv2.imread(str(tmp_path / f"{name}.png"))
+        assert min(picture.shape[:2]) > 200
+        assert np.ptp(picture) > 100
+    cost = result["cost"]["right"]
+    assert cost["parameters"] == 16
+    assert 0 < cost["milliseconds_per_1000_grasps"] < 10_000
+
+
+def test_the_best_of_a_column_is_bold(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
+    head, right, wrong, gm, _ = main_table(compare(models, data)["sources"]["generated"])
+    for name in ("accuracy", "AUROC", "top-1", "Brier"):
+        assert right[head.index(name)].startswith("**"), name
+        assert not wrong[head.index(name)].startswith("**"), name
+    assert right[head.index("accuracy")] == "**100.0** (100.0 to 100.0)"
+    assert gm[head.index("Brier")] == ""
+
+
+def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    em2 = EM2(width=16).eval()
+    image = data.source.images([0])[torch.tensor([0])]
+    assert feature_maps(em2, image).shape == (512, 14, 14)
+    assert feature_maps(Closure(), image) is None
+    dataset = data.dataset("test", em2)
+    rows, features = grasp_features(em2, dataset)
+    branch = em2.hand_branch(em2.grasp_vector(dataset.grasps[rows[:3]])[:, None])
+    torch.testing.assert_close(features[:3], branch.flatten(1), atol=1e-4, rtol=1e-4)
+    rows, features = grasp_features(Closure(), dataset)
+    hand = default_hand()
+    share = (hand.reduce(dataset.grasps[rows, SQUEEZE, JOINTS]) - hand.reduce(hand.lower)) / hand.reduce(
+        hand.upper - hand.lower
+    )
+    torch.testing.assert_close(features, share)
+    draw_inside({"em2": em2, "runs/closure": Closure()}, data, "test", tmp_path)
+    names = {path.name for path in tmp_path.glob("*.png")}
+    assert names == {"em2_maps.png", "em2_grasps.png", "runs_closure_grasps.png"}
+
+
+def test_principal_components_agree_with_scikit_learn() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(60, 5)) @ rng.normal(size=(5, 90)) + 3
+    values[:, 7] = 1.0
+    spread = values.std(0, ddof=1)
+    scaled = (values - values.mean(0)) / np.where(spread > 1e-6, spread, np.inf)
+    expected = PCA(2, svd_solver="full").fit_transform(scaled)
+    found = principal_components(torch.tensor(values)).numpy()
+    np.testing.assert_allclose(np.abs(found), np.abs(expected), atol=1e-6)
