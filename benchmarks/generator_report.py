@@ -88,10 +88,7 @@ def outcomes(variants: dict[str, Any]) -> str:
             row["scenes"],
             row["without_grasp"],
             f"{row['grasps']:,}",
-            *(
-                f"{share(row[key]['rate'])} ({span(row[key]['interval'], 100, 1)})"
-                for key in ("success", "top1", "top5")
-            ),
+            *(rate(row[key]) for key in ("success", "top1", "top5")),
             share(row["collided"]),
             share(row["starts_inside"]),
             *("" if row[key] is None else f"{row[key]:.3f}" for key in ("auroc", "auroc_within_scenes")),
@@ -173,6 +170,11 @@ def counted(row: dict[str, Any]) -> tuple[str, str]:
 def share(value: float | None) -> str:
     """In percent; nothing where there was nothing to count."""
     return "" if value is None else percent(value)
+
+
+def rate(found: dict[str, Any]) -> str:
+    """With its interval."""
+    return f"{share(found['rate'])} ({span(found['interval'], 100, 1)})"
 
 
 def points(change: dict[str, Any]) -> str:
