@@ -56,6 +56,7 @@ class CommandLine(LightningCLI):
                 "enable_progress_bar": sys.stderr.isatty(),
                 "enable_model_summary": False,
                 "log_every_n_steps": 1,
+                "use_distributed_sampler": False,  # the loaders share batches among processes themselves
             },
             save_config_kwargs={"overwrite": True},
             parser_kwargs=parser,
@@ -87,6 +88,7 @@ class CommandLine(LightningCLI):
         best = self.trainer.checkpoint_callback
         if isinstance(best, ModelCheckpoint) and best.best_model_path:
             self._load(best.best_model_path)
+        self._calibrate()
         metrics = self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)[0]
         card = {
             "data": self.datamodule.describe(),
@@ -122,6 +124,15 @@ class CommandLine(LightningCLI):
         if ckpt_path is not None:
             weights = read_checkpoint(ckpt_path) if _is_checkpoint(ckpt_path) else load(ckpt_path).state_dict()
             load_weights(self.model, weights, ckpt_path)
+
+    @torch.no_grad()
+    def _calibrate(self) -> None:
+        """Fit the probabilities to the validation split."""
+        model: GraspEvaluator = self.model.eval()
+        dataset = self.datamodule.dataset("validation", model)
+        rows = torch.arange(len(dataset)).split(self.datamodule.batch_size)  # all of them in each process
+        logit = torch.cat([model.batch_logit(dataset[part.tolist()]) for part in rows])
+        model.calibrate(logit, dataset.success)
 
     def _report(self, results: dict[str, Any]) -> None:
         if self._get(self.config, "json"):
