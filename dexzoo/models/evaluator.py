@@ -72,8 +72,17 @@ class PreparedView:
 
     def logit(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
         """Log-odds of success of grasps in the world frame; differentiable."""
-        aimed = transform_waypoints(self.T_aimed_world.to(waypoints), waypoints)
-        return self.evaluator.logit(self.scene, aimed[None])[0]
+        return self.evaluator.logit(self.scene, self._aimed(waypoints))[0]
+
+    def logit_and_spread(
+        self, waypoints: Float[Tensor, "grasp 10 28"]
+    ) -> tuple[Float[Tensor, " grasp"], Float[Tensor, " grasp"]]:
+        """Log-odds of grasps in the world frame and their spread among members; both differentiable."""
+        logit, spread = self.evaluator.logit_and_spread(self.scene, self._aimed(waypoints))
+        return logit[0], spread[0]
+
+    def _aimed(self, waypoints: Tensor) -> Tensor:
+        return transform_waypoints(self.T_aimed_world.to(waypoints), waypoints)[None]
 
 
 class GraspEvaluator(LightningModule):
@@ -128,6 +137,13 @@ class GraspEvaluator(LightningModule):
     def logit(self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]) -> Float[Tensor, "view grasp"]:
         """Log-odds of success, differentiable in the grasps, which are in the frame of the view's aimed camera."""
         raise NotImplementedError
+
+    def logit_and_spread(
+        self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]
+    ) -> tuple[Float[Tensor, "view grasp"], Float[Tensor, "view grasp"]]:
+        """Log-odds, and their standard deviation among the members of an ensemble; 0 for a model alone."""
+        logit = self.logit(scene, grasps)
+        return logit, torch.zeros_like(logit)
 
     def fit_statistics(self, images: Float[Tensor, "view 2 224 224"], waypoints: Float[Tensor, "grasp 10 28"]) -> None:
         """Set what is standardised by the training data; called once, before training. Nothing by default."""

@@ -19,7 +19,11 @@ from dexzoo.resources import resource
 _MODELS = {
     "em1": "dexzoo.models.em1.EM1",
     "em2": "dexzoo.models.em2.EM2",
+    "em2_lite": "dexzoo.models.em2_lite.EM2Lite",
+    "em3": "dexzoo.models.em3.EM3",
+    "ffh": "dexzoo.models.ffh.FFH",
     "em_fk": "dexzoo.models.em_fk.EMFK",
+    "ensemble": "dexzoo.models.ensemble.Ensemble",
 }
 _PICKLE_SUFFIXES = {".ckpt", ".pt", ".pth", ".pkl", ".pickle", ".bin"}
 _PICKLE_STARTS = (b"PK\x03\x04", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
