@@ -146,13 +146,13 @@ class EMFK(GraspEvaluator):
             height = (p @ scene["table"][:, :3, None]).squeeze(-1) + scene["table"][:, 3, None]
             told.append(torch.stack((torch.tanh(height / NEAR), torch.tanh(height / 0.2)), -1))
         if self.depth or self.image:
-            pixel = _project(p)
+            pixel = project(p)
         if self.depth:
-            told.append(_before_surface(p, n, _sample(scene["maps"], pixel)))
+            told.append(before_surface(p, n, sample(scene["maps"], pixel)))
         if self.cloud:
-            told.append(_nearest(p, n, scene["cloud"]))
+            told.append(nearest(p, n, scene["cloud"]))
         if self.image:
-            told.append(_sample(scene["features"], pixel))
+            told.append(sample(scene["features"], pixel))
         features: Tensor = torch.cat(told, -1).unflatten(1, shape[1:-1])
         return features
 
@@ -208,20 +208,20 @@ def _convolution(before: int, after: int, stride: int) -> list[nn.Module]:
     return [nn.Conv2d(before, after, 3, stride, 1, bias=False), nn.GroupNorm(8, after), nn.ReLU()]
 
 
-def _project(p: Float[Tensor, "view point 3"]) -> Float[Tensor, "view point 2"]:
+def project(p: Float[Tensor, "view point 3"]) -> Float[Tensor, "view point 2"]:
     """Places in the image, -1 to 1 over the pixels' outer borders."""
     camera = Camera.aimed()
     z = p[..., 2:].clamp_min(MIN_DEPTH)
     return p[..., :2] / z * (2 * camera.fx / camera.width)  # the principal point is the image's middle
 
 
-def _sample(maps: Float[Tensor, "view channel row column"], pixel: Float[Tensor, "view point 2"]) -> Tensor:
+def sample(maps: Float[Tensor, "view channel row column"], pixel: Float[Tensor, "view point 2"]) -> Tensor:
     """(view, point, channel) bilinear values; outside the image those at its border."""
     values = F.grid_sample(maps, pixel[:, None], padding_mode="border", align_corners=False)
     return values[:, :, 0].mT
 
 
-def _before_surface(p: Tensor, n: Tensor, seen: Tensor) -> Tensor:
+def before_surface(p: Tensor, n: Tensor, seen: Tensor) -> Tensor:
     """Gap to the surface along the ray, at two scales, and along its normal; object or table; how normals meet."""
     depth, mask, normal = seen[..., :1], seen[..., 1:2], seen[..., 2:]
     gap = depth - p[..., 2:]
@@ -231,10 +231,10 @@ def _before_surface(p: Tensor, n: Tensor, seen: Tensor) -> Tensor:
     return torch.cat((torch.tanh(gap / NEAR), torch.tanh(gap / FAR), torch.tanh(along / NEAR), mask, meet), -1)
 
 
-def _nearest(p: Tensor, n: Tensor, seen: Float[Tensor, "view cloud 6"]) -> Tensor:
+def nearest(p: Tensor, n: Tensor, seen: Float[Tensor, "view cloud 6"]) -> Tensor:
     """Distance to the nearest observed point at two scales, whether it is faced, its surface's side and normal."""
-    nearest = torch.stack([_nearest_rows(a, b) for a, b in zip(p.detach(), seen[..., :3].detach(), strict=True)])
-    found = seen.take_along_dim(nearest[..., None], dim=1)
+    rows = torch.stack([nearest_rows(a, b) for a, b in zip(p, seen[..., :3], strict=True)])
+    found = seen.take_along_dim(rows[..., None], dim=1)
     offset, normal = found[..., :3] - p, found[..., 3:]
     distance = (offset.square().sum(-1, keepdim=True) + 1e-8).sqrt()  # smooth where they meet, within 0.1 mm
     facing = (offset * n).sum(-1, keepdim=True) / distance
@@ -246,7 +246,7 @@ def _nearest(p: Tensor, n: Tensor, seen: Float[Tensor, "view cloud 6"]) -> Tenso
 
 
 @torch.no_grad()
-def _nearest_rows(p: Float[Tensor, "point 3"], cloud: Float[Tensor, "cloud 3"]) -> Tensor:
+def nearest_rows(p: Float[Tensor, "point 3"], cloud: Float[Tensor, "cloud 3"]) -> Tensor:
     """(point,) rows of the nearest in the cloud, part by part so that the distances stay in cache."""
     centre = cloud.mean(0)
     near = cloud - centre

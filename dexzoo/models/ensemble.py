@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import ClassVar, Unpack
 
 import torch
@@ -29,19 +28,12 @@ class Ensemble(GraspEvaluator):
         self.members = ["em2"] if members is None else members
         if not self.members:
             raise ValueError("an ensemble needs at least one member")
-        # in a tuple, out of the way of state_dict: each has its own file
+        # in a tuple, out of the way of state_dict, since each has its own file; they follow what they are given
         self._loaded = tuple(load(member).requires_grad_(False) for member in self.members)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Ensemble:
-        """Members follow to another device or precision."""
-        for member in self._loaded:
-            member._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        return self
 
     def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
         """What each member keeps, under its number."""
-        scenes = [member.encode(images) for member in self._loaded]
+        scenes = [member.to(images).encode(images) for member in self._loaded]
         return {f"{i}.{name}": value for i, scene in enumerate(scenes) for name, value in scene.items()}
 
     def logit(self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]) -> Float[Tensor, "view grasp"]:
@@ -55,7 +47,7 @@ class Ensemble(GraspEvaluator):
         logits = []
         for i, member in enumerate(self._loaded):
             own = {name.removeprefix(f"{i}."): value for name, value in scene.items() if name.startswith(f"{i}.")}
-            logits.append(member.logit(own, grasps) / member.temperature + member.offset)
+            logits.append(member.to(grasps).logit(own, grasps) / member.temperature + member.offset)
         every = torch.stack(logits)
         mean = every.mean(0)
         variance = (every - mean).square().mean(0)

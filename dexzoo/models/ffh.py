@@ -107,4 +107,4 @@ def _ball(count: int, radius: float) -> Tensor:
     generator = torch.Generator().manual_seed(BASIS_SEED)
     direction = torch.randn(count, 3, generator=generator)
     share = torch.rand(count, 1, generator=generator) ** (1 / 3)
-    return radius * share * direction / direction.norm(dim=1, keepdim=True)
+    return radius * share * F.normalize(direction, dim=1)

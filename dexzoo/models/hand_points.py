@@ -15,12 +15,15 @@ _CANDIDATES = 1000
 _FACING = 0.2
 """Least cosine between a point's normal and the inner direction of its link: what grasps, up to the fingertip's end."""
 
+_CLEAR = 0.001
+"""Metres before a point that must be clear of its own link, which may have other primitives there."""
+
 
 def surface_points(hand: Hand, count: int) -> tuple[Float[Tensor, "shape {count} 3"], Float[Tensor, "shape {count} 3"]]:
     """Points and outward unit normals on the inner side of each primitive, in its own frame; float64.
 
     Of evenly spread candidates on the surface of the hand the innermost is taken first, then always the one farthest
-    from those taken. What lies inside another primitive of the same link is no surface.
+    from those taken. What other primitives of the same link cover is no surface.
     """
     zero = torch.zeros(len(hand.joint_names), dtype=torch.float64)
     links = hand.forward_kinematics(zero)
@@ -34,8 +37,8 @@ def surface_points(hand: Hand, count: int) -> tuple[Float[Tensor, "shape {count}
         around = (half + shape.radius + 0.01) * candidates / candidates.abs().amax(1, keepdim=True)
         normal = box_slope(around.T.clone(), half[:, None]).T
         surface = torch.minimum(torch.maximum(around, -half), half) + shape.radius * normal
-        distance = hand.signed_distance(links, surface @ poses[i, :3, :3].T + poses[i, :3, 3])
-        outside = distance[hand.solid_names.index(shape.link)] > -1e-6
+        before = (surface + _CLEAR * normal) @ poses[i, :3, :3].T + poses[i, :3, 3]
+        outside = hand.signed_distance(links, before)[hand.solid_names.index(shape.link)] > _CLEAR - 1e-6
         facing = normal @ poses[i, :3, :3].T @ inner[shape.link]
         seen = outside & (facing > _FACING)
         surface, normal, facing = surface[seen], normal[seen], facing[seen]
