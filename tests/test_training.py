@@ -1,6 +1,7 @@
 """Training goes on after a kill, is shared among processes, and ends in honest probabilities."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import synthetic
 import torch
 from safetensors.torch import load_file
 
+import dexzoo
 from dexzoo import training
 from dexzoo.data.datamodule import BalancedBatches
 from dexzoo.models.em2 import EM2
@@ -22,7 +24,6 @@ STEPS = [
     "--model.width=32",
     "--trainer.val_check_interval=3",
     "--trainer.max_steps=12",
-    "--json",
 ]
 
 
@@ -138,7 +139,9 @@ def test_two_processes_learn_as_one(arguments: list[str], capsys: pytest.Capture
     one = json.loads(capsys.readouterr().out)["metrics"]
     two = ["--trainer.accelerator=cpu", "--trainer.devices=2", "--trainer.strategy=ddp"]
     command = [sys.executable, "-m", "dexzoo", *arguments, *dry, *two]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    environment = {**os.environ, "PYTHONPATH": str(Path(dexzoo.__file__).parent.parent)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
     both = json.loads(done.stdout.strip().splitlines()[-1])["metrics"]
     for name in ("validation_loss", "validation_auroc", "validation_top1"):
         assert both[name] == pytest.approx(one[name], abs=2e-3)
