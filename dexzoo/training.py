@@ -96,8 +96,9 @@ class CommandLine(LightningCLI):
             "seed": self._get(self.config, "seed_everything"),
             "command": self.command,
         }
+        folder = self.trainer.log_dir or "."  # asks all processes
         if self.trainer.is_global_zero:
-            path = self.model.save(self.trainer.log_dir or ".", card=card)
+            path = self.model.save(folder, card=card)
             self._report({"weights": str(path), "metrics": card["metrics"]})
 
     def validate(self, ckpt_path: str | None, **_: object) -> None:

@@ -110,7 +110,8 @@ def test_points_are_told_how_far_before_and_from_the_surface_they_are() -> None:
     scale = on / on[:, 2:]
     for lift in (-0.008, 0.0, 0.004):  # towards the camera is a positive gap
         p = (on - lift * scale)[None]
-        told = em_fk.before_surface(p, -normal[None], em_fk.sample(maps, em_fk.project(p)))[0]
+        seen = em_fk.sample(maps, em_fk.project(p))
+        told = em_fk.before_surface(p[..., 2:], scale[None], -normal[None], seen)[0]
         torch.testing.assert_close(told[:, 0], torch.full((len(on),), np.tanh(lift / em_fk.NEAR)), atol=0.02, rtol=0)
         assert (told[:, 3] == 1).all()
         assert (told[:, 4] < -0.99).all()
@@ -208,7 +209,7 @@ def test_each_ingredient_can_be_left_out(without: str, grasps: Grasps) -> None:
     view = ball(0.0)
     size = 53 - em_fk.FEATURES.get(without, 0)
     scene = model.encode(view.image()[None])
-    assert model.look(scene, camera_grasps(grasps, view)).shape == (1, 12, 19, 4, 6, size)
+    assert model.look(scene, camera_grasps(grasps, view)).shape == (1, 12, 4, 19, 6, size)
     assert model.score(view, grasps).shape == (12,)
 
 

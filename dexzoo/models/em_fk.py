@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from dexzoo import rotation
 from dexzoo.camera import Camera
-from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE, pose_matrix
+from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE
 from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
 from dexzoo.models.hand_points import surface_points
@@ -22,7 +22,7 @@ STAGES = [PREGRASP, GRIP // 2, GRIP, SQUEEZE]
 """The waypoints at which the hand is placed."""
 NUM_POINTS = 6
 """Points on each primitive of the hand."""
-NUM_CLOUD = 256
+NUM_CLOUD = 192
 NEAR, FAR = 0.01, 0.05
 """Metres over which lengths are told apart: the scales of the squashed features, contact and approach."""
 MIN_DEPTH = 0.05
@@ -51,7 +51,7 @@ class EMFK(GraspEvaluator):
 
     architecture: ClassVar[str] = "em_fk"
     points: Tensor
-    point_normals: Tensor
+    """(2, shape, point, 3): points and normals in the frame of their primitive, float64."""
 
     def __init__(
         self,
@@ -68,16 +68,14 @@ class EMFK(GraspEvaluator):
         super().__init__(**training)
         self.width, self.num_blocks, self.dropout = width, num_blocks, dropout
         self.image, self.depth, self.cloud, self.table, self.attention = image, depth, cloud, table, attention
-        points, normals = surface_points(default_hand(), NUM_POINTS)
-        self.register_buffer("points", points.float(), persistent=False)
-        self.register_buffer("point_normals", normals.float(), persistent=False)
-        shapes, stages = len(points), len(STAGES)
+        self.register_buffer("points", torch.stack(surface_points(default_hand(), NUM_POINTS)), persistent=False)
+        shapes, stages = self.points.shape[1], len(STAGES)
         if image:
             self.pyramid = Pyramid(FEATURES["image"])
             self.context = nn.Linear(self.pyramid.context_size, width)
         asked = {"hand": True, "table": table, "depth": depth, "cloud": cloud, "image": image}
         size = sum(FEATURES[name] for name, used in asked.items() if used)
-        self.place = nn.Parameter(0.02 * torch.randn(shapes, stages, NUM_POINTS, 64))
+        self.place = nn.Parameter(0.02 * torch.randn(stages, shapes, NUM_POINTS, 64))
         self.point_in = nn.Linear(size, 64)
         self.point_out = nn.Linear(64, 32)
         self.token = nn.Linear(stages * NUM_POINTS * 32, width)
@@ -88,19 +86,26 @@ class EMFK(GraspEvaluator):
         self.head = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Dropout(dropout), nn.Linear(width, 1))
 
     def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
-        """Maps of surface and normals, a cloud, the table's plane and upright axes, and the pyramid's features."""
+        """Maps, cloud, where the upright frame is that they are told in, and the pyramid's features.
+
+        The upright frame has its origin in the object's centre, z up and x along the camera's. "maps": depth of the
+        surface, the object's share and normals (view, 5, 112, 112). "cloud": points and normals (view, 192, 6).
+        "axes": rotation from the camera's frame. "centre": the origin in it, and its height over the table (view, 4).
+        """
         with torch.autocast(images.device.type, enabled=False), torch.no_grad():
             geometry = view_geometry(images.float())
-            maps = torch.cat((geometry.depth[:, None], geometry.mask[:, None], geometry.normals), 1)
+            axes = upright_axes(geometry.table)
+            points, normals = cloud(geometry, NUM_CLOUD).split(3, -1)
+            height = (geometry.points @ geometry.table[:, None, :3, None])[..., 0] + geometry.table[:, 3, None, None]
+            turned = torch.einsum("vij,vjhw->vihw", axes, geometry.normals)
+            maps = torch.cat((geometry.depth[:, None], geometry.mask[:, None], turned), 1)
             scene = {
                 "maps": maps,
-                "cloud": cloud(geometry, NUM_CLOUD),
-                "table": geometry.table,
-                "centre": geometry.centre,
-                "axes": upright_axes(geometry.table),
+                "cloud": torch.cat(((points - geometry.centre[:, None]) @ axes.mT, normals @ axes.mT), -1),
+                "axes": axes,
+                "centre": geometry.centre_and_height,
             }
             relative = ((maps[:, :1] - geometry.centre[:, 2, None, None, None]) / 0.1).clamp(-3, 3)
-            height = (geometry.points @ geometry.table[:, None, :3, None])[..., 0] + geometry.table[:, 3, None, None]
             seen = torch.cat((relative, maps[:, 1:], height[:, None] / 0.1), 1)
         if self.image:
             scene["features"], context = self.pyramid(seen)
@@ -111,8 +116,8 @@ class EMFK(GraspEvaluator):
         """Log-odds of success."""
         with torch.autocast(grasps.device.type, enabled=False):  # a millimetre is beyond bfloat16
             told = self.look({name: value.to(grasps) for name, value in scene.items()}, grasps)
-        point = self.point_out(F.gelu(self.point_in(told) + self.place))
-        x = self.token(F.gelu(point).flatten(3)) + self.shape_embedding
+        point = F.gelu(self.point_out(F.gelu(self.point_in(told) + self.place)))
+        x = self.token(point.transpose(2, 3).flatten(3)) + self.shape_embedding
         if self.image:
             context = scene["context"].to(x)[:, None, None].expand(-1, x.shape[1], -1, -1)
             x = torch.cat((x, context), dim=2)
@@ -127,33 +132,34 @@ class EMFK(GraspEvaluator):
 
     def look(
         self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]
-    ) -> Float[Tensor, "view grasp shape stage point feature"]:
+    ) -> Float[Tensor, "view grasp stage shape point feature"]:
         """What each point tells, squashed to the order of one."""
         hand = default_hand()
         way = grasps[:, :, STAGES]
-        wrist = pose_matrix(way[..., POSITION], rotation.normalize(way[..., QUATERNION]))
-        in_palm = hand.shape_poses(hand.forward_kinematics(way[..., JOINTS])).transpose(2, 3)
-        turn, shift = in_palm[..., :3, :3], in_palm[..., None, :3, 3]
-        points_palm = self.points[:, None].to(grasps) @ turn.mT + shift
-        normals_palm = self.point_normals[:, None].to(grasps) @ turn.mT
-        turn, shift = wrist[:, :, None, :, :3, :3], wrist[:, :, None, :, None, :3, 3]
-        shape = points_palm.shape
-        p = (points_palm @ turn.mT + shift).flatten(1, -2)  # (view, grasp * shape * stage * point, 3)
-        n = (normals_palm @ turn.mT).flatten(1, -2)
-        axes = scene["axes"].mT
-        told = [(p - scene["centre"][:, None]) @ axes / 0.1, n @ axes, points_palm.flatten(1, -2) / 0.1]
+        in_palm = hand.shape_poses(hand.forward_kinematics(way[..., JOINTS]))
+        points, normals = torch.einsum("vgwsij,asnj->avgwsni", in_palm[..., :3, :3], self.points.to(grasps))
+        points = points + in_palm[..., None, :3, 3]
+        # into the upright frame, see `encode`; there height over the table is z, but for that of the origin
+        axes, centre = scene["axes"][:, None, None], scene["centre"][:, None, None]
+        origin = (axes @ (way[..., POSITION] - centre[..., :3])[..., None]).mT
+        turn = (axes @ rotation.to_matrix(rotation.normalize(way[..., QUATERNION]))).mT
+        p = (points.flatten(3, 4) @ turn + origin).flatten(1, -2)  # (view, grasp * stage * shape * point, 3)
+        n = (normals.flatten(3, 4) @ turn).flatten(1, -2)
+        told = [p / 0.1, n, points.flatten(1, -2) / 0.1]
         if self.table:
-            height = (p @ scene["table"][:, :3, None]).squeeze(-1) + scene["table"][:, 3, None]
-            told.append(torch.stack((torch.tanh(height / NEAR), torch.tanh(height / 0.2)), -1))
+            height = p[..., 2:] + scene["centre"][:, None, 3:]
+            told.append(torch.cat((torch.tanh(height / NEAR), torch.tanh(height / 0.2)), -1))
         if self.depth or self.image:
-            pixel = project(p)
+            in_camera = p @ scene["axes"] + scene["centre"][:, None, :3]
+            pixel = project(in_camera)
         if self.depth:
-            told.append(before_surface(p, n, sample(scene["maps"], pixel)))
+            ray = (in_camera / in_camera[..., 2:].clamp_min(MIN_DEPTH)) @ scene["axes"].mT
+            told.append(before_surface(in_camera[..., 2:], ray, n, sample(scene["maps"], pixel)))
         if self.cloud:
             told.append(nearest(p, n, scene["cloud"]))
         if self.image:
             told.append(sample(scene["features"], pixel))
-        features: Tensor = torch.cat(told, -1).unflatten(1, shape[1:-1])
+        features: Tensor = torch.cat(told, -1).unflatten(1, points.shape[1:-1])
         return features
 
 
@@ -221,11 +227,13 @@ def sample(maps: Float[Tensor, "view channel row column"], pixel: Float[Tensor, 
     return values[:, :, 0].mT
 
 
-def before_surface(p: Tensor, n: Tensor, seen: Tensor) -> Tensor:
-    """Gap to the surface along the ray, at two scales, and along its normal; object or table; how normals meet."""
+def before_surface(z: Tensor, ray: Tensor, n: Tensor, seen: Tensor) -> Tensor:
+    """Gap to the surface along the ray, at two scales, and along its normal; object or table; how normals meet.
+
+    z: (view, point, 1) depth of the points; ray: (view, point, 3) directions to them, of depth 1.
+    """
     depth, mask, normal = seen[..., :1], seen[..., 1:2], seen[..., 2:]
-    gap = depth - p[..., 2:]
-    ray = p / p[..., 2:].clamp_min(MIN_DEPTH)
+    gap = depth - z
     along = -gap * (ray * normal).sum(-1, keepdim=True)
     meet = (n * normal).sum(-1, keepdim=True)
     return torch.cat((torch.tanh(gap / NEAR), torch.tanh(gap / FAR), torch.tanh(along / NEAR), mask, meet), -1)
@@ -247,8 +255,6 @@ def nearest(p: Tensor, n: Tensor, seen: Float[Tensor, "view cloud 6"]) -> Tensor
 
 @torch.no_grad()
 def nearest_rows(p: Float[Tensor, "point 3"], cloud: Float[Tensor, "cloud 3"]) -> Tensor:
-    """(point,) rows of the nearest in the cloud, part by part so that the distances stay in cache."""
-    centre = cloud.mean(0)
-    near = cloud - centre
-    half = -0.5 * near.square().sum(1)
-    return torch.cat([torch.addmm(half, part - centre, near.mT).argmax(1) for part in p.split(_PART)])
+    """(point,) rows of the nearest in a cloud that lies about the origin, part by part."""
+    half = -0.5 * cloud.square().sum(1)
+    return torch.cat([torch.addmm(half, part, cloud.mT).argmax(1) for part in p.split(_PART)])

@@ -57,8 +57,7 @@ class FFH(GraspEvaluator):
         axes = upright_axes(geometry.table)
         points = (cloud(geometry, NUM_CLOUD)[..., :3] - geometry.centre[:, None]) @ axes.mT
         distance = torch.stack([torch.cdist(self.basis.to(seen), seen).amin(1) for seen in points])
-        height = (geometry.centre * geometry.table[:, :3]).sum(1, keepdim=True) + geometry.table[:, 3:]
-        return {"distance": distance, "axes": axes, "centre": torch.cat((geometry.centre, height), 1)}
+        return {"distance": distance, "axes": axes, "centre": geometry.centre_and_height}
 
     def logit(self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]) -> Float[Tensor, "view grasp"]:
         """Log-odds of success."""

@@ -42,6 +42,12 @@ class ViewGeometry(NamedTuple):
         """The points that the pixels of `depth` show."""
         return _rays(MAP_SIZE).to(self.depth) * self.depth[..., None]
 
+    @property
+    def centre_and_height(self) -> Float[Tensor, "view 4"]:
+        """The object's centre, and its height over the table."""
+        height = (self.centre * self.table[:, :3]).sum(1, keepdim=True) + self.table[:, 3:]
+        return torch.cat((self.centre, height), 1)
+
 
 def view_geometry(images: Float[Tensor, "view 2 224 224"]) -> ViewGeometry:
     """Of images as evaluators get them: the object's depth and height over the table, 0 elsewhere."""
