@@ -1,15 +1,19 @@
 """Trunks hold the weights that their cards say, converted right, and are frozen."""
 
 import hashlib
+import importlib.util
 import json
 from pathlib import Path
 
 import pytest
+import synthetic
 import torch
 
+from dexzoo.data.grasp_set import GraspSet
 from dexzoo.models import trunks
 from dexzoo.models.em1 import EM1
 from dexzoo.models.em2 import EM2
+from dexzoo.models.em3 import EM3
 from dexzoo.resources import resource
 
 SHIPPED = {"hed": ("vgg16_hed", 14_714_688), "lite0": ("efficientnet_lite0", 3_350_000)}
@@ -68,3 +72,24 @@ def test_weights_that_cannot_be_had_are_named(monkeypatch: pytest.MonkeyPatch, t
     monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", offline)
     with pytest.raises(FileNotFoundError, match=r"ImageNet weights cannot be fetched .*use a shipped trunk"):
         trunks.load_trunk("resnet50")
+
+
+@pytest.mark.slow
+def test_a_trunk_is_trained_on_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = Path(__file__).parent.parent / "assets" / "checkpoints" / "train_resnet50.py"
+    spec = importlib.util.spec_from_file_location("train_resnet50", script)
+    assert spec is not None
+    assert spec.loader is not None
+    train_resnet50 = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(train_resnet50)
+    folder = synthetic.write(tmp_path / "grasps", num_grasps=4)
+    call = ["--data", str(folder), "--out", str(tmp_path), "--epochs", "3", "--batch_size", "4"]
+    train_resnet50.main(call)
+    card = json.loads((tmp_path / "resnet50_views.json").read_text())
+    assert len(card["accuracy_by_epoch"]) == 3
+    monkeypatch.setattr(trunks, "resource", lambda name: tmp_path)
+    trunks.load_trunk.cache_clear()
+    features = EM3().encode(GraspSet(folder).images([0, 1])[torch.arange(2)])["features"]
+    trunks.load_trunk.cache_clear()
+    assert features.shape == (2, 2048)
+    assert torch.isfinite(features).all()

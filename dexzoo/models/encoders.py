@@ -50,13 +50,17 @@ class DepthEncoder(nn.Module):
         self.mean.copy_(pixels.mean(0))
         self.std.copy_(pixels.std(0).clamp_min(MIN_STD))
 
+    def standardise(self, images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view 3 224 224"]:
+        """The colourised depth, standardised and clipped."""
+        x = (colourise(images[:, 0].float()) - self.mean[:, None, None].float()) / self.std[:, None, None].float()
+        return x.clamp(-CLIP, CLIP)
+
     @torch.no_grad()
     def forward(self, images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view channel row column"]:
         """The last convolution's features, after its ReLU and before the last pooling."""
         network = load_trunk(self.name).to(images.device)
         scale = trunk(self.name).scale
-        x = (colourise(images[:, 0].float()) - self.mean[:, None, None].float()) / self.std[:, None, None].float()
-        x = (scale * x.clamp(-CLIP, CLIP)).contiguous(memory_format=torch.channels_last)
+        x = (scale * self.standardise(images)).contiguous(memory_format=torch.channels_last)
         with torch.autocast(images.device.type, torch.bfloat16):
             features: Tensor = network(x)
         return (features.float() / scale).contiguous()
