@@ -76,10 +76,10 @@ def shipped_card(name: str) -> dict[str, Any] | None:
 def _shipped(name: str) -> Path:
     path = resource("checkpoints") / f"{name}.safetensors"
     if not path.is_file():
-        raise FileNotFoundError(
-            f"model {name} comes without weights; train them with `python -m dexzoo fit --config {name}.yaml` and load "
-            "the run's folder"
-        )
+        how = f"train them with `python -m dexzoo fit --config {name}.yaml` and load the run's folder"
+        if name == "ensemble":
+            how = "make one of trained models with Ensemble(members=[...]).save(FOLDER) and load the folder"
+        raise FileNotFoundError(f"model {name} comes without weights; {how}")
     return path
 
 
