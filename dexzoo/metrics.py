@@ -50,7 +50,7 @@ class TopKSuccess(Metric):
 
     def compute(self) -> Tensor:
         """The mean over scenes, a scalar; nan before any update."""
-        if not len(self.preds):
+        if not self.preds:
             return torch.tensor(float("nan"))
         preds, target, indexes = (dim_zero_cat(state) for state in (self.preds, self.target, self.indexes))
         order = preds.argsort(descending=True, stable=True)
