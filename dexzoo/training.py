@@ -35,6 +35,8 @@ NOT_NEWS = (
 )
 """Warnings of Lightning's that a user can do nothing about."""
 
+_log = logging.getLogger(__name__)
+
 
 class CommandLine(LightningCLI):
     """Lightning's command line, with weights from the zoo, and with export after fitting.
@@ -129,9 +131,12 @@ class CommandLine(LightningCLI):
 
     @torch.no_grad()
     def _calibrate(self) -> None:
-        """Fit the probabilities to the validation split."""
+        """Fit the probabilities to the validation split, where it has both successes and failures."""
         model: GraspEvaluator = self.model.eval()
         dataset = self.datamodule.dataset("validation", model)
+        if not 0 < dataset.success.sum() < len(dataset):
+            _log.warning("the validation split has one outcome only; probabilities stay uncalibrated")
+            return
         rows = torch.arange(len(dataset)).split(self.datamodule.batch_size)  # all of them in each process
         logit = torch.cat([model.batch_logit(dataset[part.tolist()]) for part in rows])
         model.calibrate(logit, dataset.success)
