@@ -119,8 +119,8 @@ def refine(
     refined = torch.where(accepted[:, None, None], refined, grasps.waypoints.detach())
     return Refinement(
         Grasps(refined, grasps.frame, grasps.log_likelihood),
-        before.sigmoid(),
-        torch.where(accepted, after, before).sigmoid(),
+        model.probability(before),
+        model.probability(torch.where(accepted, after, before)),
         accepted,
         {name: torch.where(accepted, penalties_after[name], penalties_before[name]) for name in WEIGHTS},
     )

@@ -35,6 +35,8 @@ NOT_NEWS = (
 )
 """Warnings of Lightning's that a user can do nothing about."""
 
+_log = logging.getLogger(__name__)
+
 
 class CommandLine(LightningCLI):
     """Lightning's command line, with weights from the zoo, and with export after fitting.
@@ -56,6 +58,7 @@ class CommandLine(LightningCLI):
                 "enable_progress_bar": sys.stderr.isatty(),
                 "enable_model_summary": False,
                 "log_every_n_steps": 1,
+                "use_distributed_sampler": False,  # the loaders share batches among processes themselves
             },
             save_config_kwargs={"overwrite": True},
             parser_kwargs=parser,
@@ -87,6 +90,7 @@ class CommandLine(LightningCLI):
         best = self.trainer.checkpoint_callback
         if isinstance(best, ModelCheckpoint) and best.best_model_path:
             self._load(best.best_model_path)
+        self._calibrate()
         metrics = self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)[0]
         card = {
             "data": self.datamodule.describe(),
@@ -94,8 +98,10 @@ class CommandLine(LightningCLI):
             "seed": self._get(self.config, "seed_everything"),
             "command": self.command,
         }
-        path = self.model.save(self.trainer.log_dir or ".", card=card)
-        self._report({"weights": str(path), "metrics": card["metrics"]})
+        folder = self.trainer.log_dir or "."  # asks all processes
+        if self.trainer.is_global_zero:
+            path = self.model.save(folder, card=card)
+            self._report({"weights": str(path), "metrics": card["metrics"]})
 
     def validate(self, ckpt_path: str | None, **_: object) -> None:
         """Metrics over the validation split."""
@@ -122,6 +128,18 @@ class CommandLine(LightningCLI):
         if ckpt_path is not None:
             weights = read_checkpoint(ckpt_path) if _is_checkpoint(ckpt_path) else load(ckpt_path).state_dict()
             load_weights(self.model, weights, ckpt_path)
+
+    @torch.no_grad()
+    def _calibrate(self) -> None:
+        """Fit the probabilities to the validation split, where it has both successes and failures."""
+        model: GraspEvaluator = self.model.eval()
+        dataset = self.datamodule.dataset("validation", model)
+        if not 0 < dataset.success.sum() < len(dataset):
+            _log.warning("the validation split has one outcome only; probabilities stay uncalibrated")
+            return
+        rows = torch.arange(len(dataset)).split(self.datamodule.batch_size)  # all of them in each process
+        logit = torch.cat([model.batch_logit(dataset[part.tolist()]) for part in rows])
+        model.calibrate(logit, dataset.success)
 
     def _report(self, results: dict[str, Any]) -> None:
         if self._get(self.config, "json"):

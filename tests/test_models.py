@@ -1,13 +1,14 @@
-import hashlib
 import itertools
 import json
 import pickle
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import synthetic
 import torch
+import torchvision
 from lightning.pytorch import Callback, LightningModule, Trainer
 from safetensors.torch import load_file
 
@@ -15,7 +16,7 @@ from dexzoo import training
 from dexzoo.camera import Observation
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.grasp import POSITION, QUATERNION, Grasps
-from dexzoo.models import encoders, evaluator, zoo
+from dexzoo.models import encoders, evaluator, trunks, zoo
 from dexzoo.models.em1 import EM1
 from dexzoo.models.em2 import EM2
 from dexzoo.models.evaluator import GraspEvaluator
@@ -32,6 +33,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def data(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> GraspDataModule:
     return GraspDataModule(str(folder), cache=str(tmp_path_factory.mktemp("cache")))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def resnet_trunk() -> Iterator[None]:
+    """ResNet-50 with drawn weights where those trained here are not beside the tests."""
+    if (resource("checkpoints") / "resnet50_views.safetensors").is_file():
+        yield
+        return
+    torch.manual_seed(0)
+    weights = torchvision.models.resnet50(zero_init_residual=True).state_dict()
+    weights = {name: value for name, value in weights.items() if not name.startswith("fc.")}
+    with pytest.MonkeyPatch.context() as patch:
+        drawn = trunks.TRUNKS["resnet50_views"]._replace(weights=lambda: weights)
+        patch.setitem(trunks.TRUNKS, "resnet50_views", drawn)
+        yield
 
 
 @pytest.fixture(scope="module", params=zoo.list_models())
@@ -152,6 +168,19 @@ def test_saving_and_loading_keep_the_scores(
     assert not any("trunk" in name for name in load_file(path))
 
 
+def test_a_world_laid_out_otherwise_changes_nothing(
+    model: GraspEvaluator, observation: Observation, grasps: Grasps
+) -> None:
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    motion[:2, 3] = torch.tensor([0.3, -2.0])
+    moved = Observation(
+        observation.depth, observation.camera, motion.numpy() @ observation.T_world_camera, mask=observation.mask
+    )
+    expected = model.score(observation, grasps)
+    torch.testing.assert_close(model.score(moved, grasps.moved(motion)), expected, atol=1e-3, rtol=0)
+
+
 def test_a_half_turn_of_sign_in_a_quaternion_changes_nothing(model: GraspEvaluator, data: GraspDataModule) -> None:
     scene = model.encode(data.source.observation(0).image()[None])
     waypoints = data.waypoints[None, :4]
@@ -180,21 +209,6 @@ def test_em2_has_the_thesis_sizes(width: int, total: int) -> None:
     head = 1024 * width + width + width * width + width + 2 * width + 2
     with torch.device("meta"):
         assert count(EM2(width=width)) == hand + head == total
-
-
-def test_the_trunk_is_vgg16_frozen_and_converted_right() -> None:
-    trunk = encoders.load_trunk("hed")
-    assert count(trunk) == 14_714_688
-    assert not any(parameter.requires_grad for parameter in trunk.parameters())
-    # golden/vgg16_hed.py computes these from the source's own arrays; ours are stored in float16
-    golden = json.loads((Path(__file__).parent / "golden" / "vgg16_hed.json").read_text())
-    channel, row, column = torch.meshgrid(torch.arange(3), torch.arange(32), torch.arange(32), indexing="ij")
-    features = trunk[:-1](60 * torch.sin(0.3 * row + 0.7 * column + channel)[None])[0]
-    largest = float(features.max())
-    torch.testing.assert_close(
-        features[golden["channels"]], torch.tensor(golden["features"]), atol=2e-3 * largest, rtol=0
-    )
-    assert float(features.mean()) == pytest.approx(golden["mean"], rel=2e-3)
 
 
 def test_280_numbers_are_one_hot_type_then_ten_times_27(data: GraspDataModule) -> None:
@@ -265,7 +279,8 @@ def test_fit_writes_a_run_that_load_and_the_other_commands_take(
     checkpoint = torch.load(weights.parent / "checkpoints" / "best.ckpt", weights_only=True)
     exported = load_file(weights)
     raw = checkpoint["current_model_state"]
-    assert all(torch.equal(exported[name].half(), value.half()) for name, value in checkpoint["state_dict"].items())
+    average = {name: value for name, value in checkpoint["state_dict"].items() if name not in ("temperature", "offset")}
+    assert all(torch.equal(exported[name].half(), value.half()) for name, value in average.items())
     assert any(not torch.equal(exported[name].half(), value.half()) for name, value in raw.items())
 
     figures = []
@@ -460,14 +475,3 @@ def test_a_hub_repository_is_a_folder(saved: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(hub, "snapshot_download", lambda name, **_: asked.append(name) or str(saved.parent))
     assert isinstance(zoo.load("hf://someone/em2"), EM2)
     assert asked == ["someone/em2"]
-
-
-def test_a_stranger_trunk_is_named() -> None:
-    with pytest.raises(ValueError, match="trunk 'resnet' is unknown; use one of hed, imagenet"):
-        EM2(trunk="resnet")
-
-
-def test_the_shipped_trunk_is_what_its_card_says() -> None:
-    path = resource("checkpoints") / "vgg16_hed.safetensors"
-    card = json.loads(path.with_suffix(".json").read_text())
-    assert hashlib.sha256(path.read_bytes()).hexdigest() == card["sha256"]

@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import sys
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from rich.progress import track
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
-from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler, SequentialSampler, WeightedRandomSampler
+from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
 
 from dexzoo.data.grasp_set import GraspSet, ViewImages, user_cache
 from dexzoo.data.schema import SOURCES, SPLITS, VERSION
@@ -26,6 +27,8 @@ from dexzoo.resources import resource
 
 VIEWS_PER_FILE = 64
 """Views that are encoded and cached together; a grown set keeps the files of its old views."""
+GRASPS_PER_VIEW = 8
+"""Grasps in a training batch that share a view, where encoding views is part of each step."""
 STATISTICS_VIEWS = 256
 """Training views that the image statistics are taken from, evenly spaced."""
 
@@ -49,14 +52,80 @@ class GraspDataset(Dataset[Batch]):
 
     def __getitem__(self, index: list[int]) -> Batch:
         rows = torch.tensor(index)
-        view = self.view[rows]
+        shown, view = self.view[rows].unique(return_inverse=True)
         views: Scene | Tensor
         if isinstance(self.views, ViewImages):
-            shown, place = view.unique(return_inverse=True)
-            views = self.views[shown][place]
+            views = self.views[shown]
         else:
-            views = {name: value[view] for name, value in self.views.items()}
-        return Batch(views, self.grasps[rows, None], self.success[rows], self.scene_index[rows])
+            views = {name: value[shown] for name, value in self.views.items()}
+        return Batch(views, view, self.grasps[rows, None], self.success[rows], self.scene_index[rows])
+
+
+class BalancedBatches(Sampler[list[int]]):
+    """Batches with as many successes as failures, drawn with replacement; goes on where it was stopped.
+
+    The batch with number n is a function of the seed and n alone. Each call of `iter` hands out as many batches as
+    an epoch has, from number `drawn` on.
+
+    success, view: (num_grasps,) of the dataset. batch_size: grasps in a batch, shared among processes.
+    grasps_per_view: grasps of a batch that share a view, drawn with the views' own weights, so that each grasp is as
+    likely as it is with 1. rank, world_size: which part of each batch this process takes, of how many.
+    """
+
+    def __init__(
+        self,
+        success: Tensor,
+        view: Tensor,
+        batch_size: int,
+        grasps_per_view: int = 1,
+        seed: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        share = 1 / torch.bincount(success.long(), minlength=2).double()
+        self.order = view.argsort(stable=True).numpy()  # grasps of a view stand together
+        self.end = share[success.long()].numpy()[self.order].cumsum()
+        last = np.flatnonzero(np.diff(view.numpy()[self.order], append=-1))
+        self.view_end = self.end[last]
+        self.batch_size, self.grasps_per_view, self.seed = batch_size, grasps_per_view, seed
+        self.part = slice(rank * batch_size // world_size, (rank + 1) * batch_size // world_size)
+        self.drawn = 0
+
+    def __len__(self) -> int:
+        return -(-len(self.order) // self.batch_size)
+
+    def __iter__(self) -> Iterator[list[int]]:
+        for _ in range(len(self)):
+            self.drawn += 1
+            yield self.batch(self.drawn - 1)
+
+    def batch(self, number: int) -> list[int]:
+        """The rows of a batch, or of this process's part of it."""
+        rng = np.random.default_rng((self.seed, number))
+        num_views = -(-self.batch_size // self.grasps_per_view)
+        view = np.searchsorted(self.view_end, self.end[-1] * rng.random(num_views), side="right")
+        low, high = np.append(0.0, self.view_end)[view], self.view_end[view]
+        place = low + (high - low) * rng.random((self.grasps_per_view, num_views))
+        rows = self.order[np.searchsorted(self.end[:-1], place.T.ravel(), side="right")]
+        chosen: list[int] = rows[: self.batch_size][self.part].tolist()
+        return chosen
+
+
+class ResumableLoader(DataLoader[Batch]):
+    """A loader of balanced batches that Lightning's checkpoints can take up in mid-epoch."""
+
+    def state_dict(self) -> dict[str, int]:
+        """How many batches were drawn."""
+        return {"drawn": self._batches.drawn}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Go on after so many batches."""
+        self._batches.drawn = state["drawn"]
+
+    @property
+    def _batches(self) -> BalancedBatches:
+        assert isinstance(self.sampler, BalancedBatches)
+        return self.sampler
 
 
 class GraspDataModule(LightningDataModule):
@@ -64,7 +133,7 @@ class GraspDataModule(LightningDataModule):
 
     folder: the set (`dexzoo.data.schema`), a folder or an address such as s3://...; a relative folder is looked up in
     the working folder, then beside the package.
-    batch_size: grasps in a batch; training draws as many successes as failures, with replacement.
+    batch_size: grasps in a batch, over all processes; training draws as many successes as failures, with replacement.
     sources: the grasps that are trained on: generated, perturbed, refined.
     evaluation_sources: those that are validated, tested and predicted; what a user ranks is generated.
     predict_split: the split that `predict` runs over.
@@ -146,16 +215,21 @@ class GraspDataModule(LightningDataModule):
         )
 
     def loader(self, dataset: GraspDataset, *, balanced: bool = False) -> DataLoader[Batch]:
-        """Batches of a dataset, in order, or drawn with as many successes as failures."""
-        sampler: Sampler[int] = SequentialSampler(dataset)
-        if balanced:
-            count = torch.bincount(dataset.success.long(), minlength=2)
-            if not count.all():
-                raise ValueError(f"grasp set {self.folder}: training needs both successes and failures")
-            generator = torch.Generator().manual_seed(self.seed)
-            weights = (1 / count)[dataset.success.long()]
-            sampler = WeightedRandomSampler(weights.tolist(), len(dataset), generator=generator)
-        return DataLoader(dataset, sampler=BatchSampler(sampler, self.batch_size, drop_last=False), batch_size=None)
+        """Batches of a dataset, in order, or drawn with as many successes as failures.
+
+        Of several processes each takes its part.
+        """
+        rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        unused = torch.Generator()  # with none, a loader draws from the global one when it starts
+        if not balanced:
+            rows = range(rank, len(dataset), world_size)
+            batches = BatchSampler(rows, self.batch_size, drop_last=False)
+            return DataLoader(dataset, sampler=batches, batch_size=None, generator=unused)
+        if not torch.bincount(dataset.success.long(), minlength=2).all():
+            raise ValueError(f"grasp set {self.folder}: training needs both successes and failures")
+        together = GRASPS_PER_VIEW if isinstance(dataset.views, ViewImages) else 1
+        drawn = BalancedBatches(dataset.success, dataset.view, self.batch_size, together, self.seed, rank, world_size)
+        return ResumableLoader(dataset, sampler=drawn, batch_size=None, generator=unused)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Balanced batches of the training split."""

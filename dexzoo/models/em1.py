@@ -36,6 +36,8 @@ class EM1(GraspEvaluator):
         super().__init__(**training)
         self.trunk, self.dropout, self.gain = trunk, dropout, gain
         self.image_encoder = DepthEncoder(trunk)
+        if self.image_encoder.channels != 512:
+            raise ValueError(f"trunk {trunk!r} is no VGG-16, which EM1 asks for; use hed or imagenet")
         self.grasp_vector = GraspVector()
         self.image_branch = nn.Sequential(*dense(512 * 7 * 7, 1024, dropout))
         self.hand_branch = nn.Sequential(*dense(280, 1024, dropout))

@@ -23,7 +23,8 @@ class EM2(GraspEvaluator):
     softmax over {fail, success}. ReLU everywhere, dropout after every FC, Xavier weights.
 
     width: 2048 as the thesis' text has it; its Table 3.1 has 4096.
-    trunk: "hed" (shipped) or "imagenet" (fetched). dropout: probability of dropping a unit.
+    trunk: the thesis' VGG-16, "hed" (shipped) or "imagenet" (fetched), or another of `trunks.TRUNKS`.
+    dropout: probability of dropping a unit.
     gain: of Xavier's weights; the root of 2 keeps the variance through ReLUs, which 1, the thesis', does not.
     The other arguments are `GraspEvaluator`'s.
     """
@@ -52,7 +53,9 @@ class EM2(GraspEvaluator):
                 layers += [nn.Conv1d(channels, size, kernel_size=3, padding=1), nn.ReLU()]
                 channels = size
         self.hand_branch = nn.Sequential(*layers)
-        self.head = nn.Sequential(*dense(1024, width, dropout, depth=2), nn.Linear(width, 2))
+        self.head = nn.Sequential(
+            *dense(512 + self.image_encoder.channels, width, dropout, depth=2), nn.Linear(width, 2)
+        )
         initialise(self, gain)
 
     def fit_statistics(self, images: Float[Tensor, "view 2 224 224"], waypoints: Float[Tensor, "grasp 10 28"]) -> None:
@@ -61,7 +64,7 @@ class EM2(GraspEvaluator):
         self.grasp_vector.fit_statistics(waypoints)
 
     def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
-        """The trunk's features, averaged over the image: (view, 512)."""
+        """The trunk's features, averaged over the image: (view, channel), 512 of them with VGG-16."""
         return {"features": self.image_encoder(images).mean((2, 3))}
 
     def logit(self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]) -> Float[Tensor, "view grasp"]:

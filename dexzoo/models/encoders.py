@@ -1,59 +1,25 @@
-"""What evaluators see: VGG-16 on the colourised depth image, and a grasp as 280 standardised numbers."""
+"""What evaluators see: a frozen trunk on the colourised depth image, and a grasp as 280 standardised numbers."""
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchvision.models import VGG16_Weights, vgg16
 
 from dexzoo import rotation
 from dexzoo.camera import colourise
 from dexzoo.grasp import NUM_TYPES, NUM_WAYPOINTS, QUATERNION, TYPE, WAYPOINT_SIZE
-from dexzoo.resources import resource
+from dexzoo.models.trunks import load_trunk, trunk
 
-TRUNK_SCALE = {"hed": 60.0, "imagenet": 1.0}
-"""Trunks by name, with the standard deviation of the images each was trained on."""
 VECTOR_SIZE = NUM_TYPES + NUM_WAYPOINTS * (WAYPOINT_SIZE - 1)
 """A grasp as a vector: ten numbers of the type, then 27 for each of ten waypoints; 280."""
 CLIP = 3.0
 MIN_STD = 1e-6
 
 
-@lru_cache(maxsize=2)
-def load_trunk(name: str) -> nn.Sequential:
-    """VGG-16's 13 convolutions with their poolings, frozen; one copy of each is shared by all models.
-
-    name: "hed", shipped, ImageNet weights fine-tuned for edge detection (Xie and Tu 2015); "imagenet", fetched by
-    torchvision. Raises ValueError for another name, FileNotFoundError where weights cannot be had.
-    """
-    if name == "hed":
-        path = resource("checkpoints") / "vgg16_hed.safetensors"
-        if not path.is_file():
-            raise FileNotFoundError(f"trunk weights {path} are missing; reinstall dexzoo or run convert_hed.py")
-        weights = load_file(path)
-    elif name == "imagenet":
-        try:
-            weights = VGG16_Weights.IMAGENET1K_V1.get_state_dict(progress=False, check_hash=True, weights_only=True)
-        except OSError as error:
-            raise FileNotFoundError(f'trunk "imagenet" cannot be fetched ({error}); use the shipped "hed"') from None
-        prefix = "features."
-        weights = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
-    else:
-        raise ValueError(f"trunk {name!r} is unknown; use one of {', '.join(TRUNK_SCALE)}")
-    with torch.device("meta"):  # torchvision would draw 138 million random weights that nobody needs
-        trunk: nn.Sequential = vgg16(weights=None).features
-    trunk.load_state_dict({key: value.float() for key, value in weights.items()}, assign=True)
-    trunk.requires_grad_(False)
-    return trunk.to(memory_format=torch.channels_last).eval()
-
-
 class DepthEncoder(nn.Module):
-    """Depth image -> feature map of a frozen VGG-16, which runs in bfloat16.
+    """Depth image -> feature map of a frozen trunk (`dexzoo.models.trunks`), which runs in bfloat16.
 
     The colourised depth is standardised by channel, with mean and standard deviation over the object pixels of the
     training views, and clipped to three standard deviations: that puts the background, of depth 0, at -3. The thesis
@@ -62,16 +28,16 @@ class DepthEncoder(nn.Module):
     trunk was trained on, and features back by the same factor, so that they are of the order of one.
 
     The trunk is not a submodule: it is neither trained, averaged nor saved, only shared.
+    channels: of the feature map.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, trunk: str = "hed") -> None:
+    def __init__(self, name: str = "hed") -> None:
         super().__init__()
-        if trunk not in TRUNK_SCALE:
-            raise ValueError(f"trunk {trunk!r} is unknown; use one of {', '.join(TRUNK_SCALE)}")
-        self.trunk = trunk
+        self.name = name
+        self.channels = trunk(name).channels
         self.register_buffer("mean", torch.tensor([0.57, 0.0, 0.0]))
         self.register_buffer("std", torch.tensor([0.1, 0.03, 0.03]))
 
@@ -84,15 +50,19 @@ class DepthEncoder(nn.Module):
         self.mean.copy_(pixels.mean(0))
         self.std.copy_(pixels.std(0).clamp_min(MIN_STD))
 
-    @torch.no_grad()
-    def forward(self, images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view 512 14 14"]:
-        """The last convolution's features, after its ReLU and before the last pooling."""
-        trunk = load_trunk(self.trunk).to(images.device)
-        scale = TRUNK_SCALE[self.trunk]
+    def standardise(self, images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view 3 224 224"]:
+        """The colourised depth, standardised and clipped."""
         x = (colourise(images[:, 0].float()) - self.mean[:, None, None].float()) / self.std[:, None, None].float()
-        x = (scale * x.clamp(-CLIP, CLIP)).contiguous(memory_format=torch.channels_last)
+        return x.clamp(-CLIP, CLIP)
+
+    @torch.no_grad()
+    def forward(self, images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view channel row column"]:
+        """The last convolution's features, after its ReLU and before the last pooling."""
+        network = load_trunk(self.name).to(images.device)
+        scale = trunk(self.name).scale
+        x = (scale * self.standardise(images)).contiguous(memory_format=torch.channels_last)
         with torch.autocast(images.device.type, torch.bfloat16):
-            features: Tensor = trunk[:-1](x)
+            features: Tensor = network(x)
         return (features.float() / scale).contiguous()
 
 

@@ -27,22 +27,24 @@ from dexzoo.models.averaging import MovingAverage
 
 CARD_FORMAT = "dexzoo.evaluator.1"
 OPTIMIZERS = ("sgd", "adamw")
-CHUNK = 512
-"""Grasps scored at once; bounds memory."""
+CHUNK = 128
+"""Grasps scored at once; bounds memory, and keeps what lies between layers in cache."""
 
 Scene = dict[str, Tensor]
 """What an architecture keeps of its views: tensors whose first dimension is the view."""
 
 
 class Batch(NamedTuple):
-    """Grasps with the view each is paired with; the first dimension of all is the grasp.
+    """Grasps with the view each is paired with.
 
-    views: the encoded views, or, where the encoder is trained, their images (batch, 2, 224, 224).
+    views: the views that occur, encoded, or, where the encoder is trained, as images (view, 2, 224, 224).
+    view: (batch,) which of them each grasp is paired with.
     grasps: (batch, 1, 10, 28) waypoints in the frame of the view's aimed camera.
     success: (batch,) 0 or 1. scene_index: (batch,) which scene of the set.
     """
 
     views: Scene | Tensor
+    view: Tensor
     grasps: Tensor
     success: Tensor
     scene_index: Tensor
@@ -70,8 +72,17 @@ class PreparedView:
 
     def logit(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
         """Log-odds of success of grasps in the world frame; differentiable."""
-        aimed = transform_waypoints(self.T_aimed_world.to(waypoints), waypoints)
-        return self.evaluator.logit(self.scene, aimed[None])[0]
+        return self.evaluator.logit(self.scene, self._aimed(waypoints))[0]
+
+    def logit_and_spread(
+        self, waypoints: Float[Tensor, "grasp 10 28"]
+    ) -> tuple[Float[Tensor, " grasp"], Float[Tensor, " grasp"]]:
+        """Log-odds of grasps in the world frame and their spread among members; both differentiable."""
+        logit, spread = self.evaluator.logit_and_spread(self.scene, self._aimed(waypoints))
+        return logit[0], spread[0]
+
+    def _aimed(self, waypoints: Tensor) -> Tensor:
+        return transform_waypoints(self.T_aimed_world.to(waypoints), waypoints)[None]
 
 
 class GraspEvaluator(LightningModule):
@@ -84,6 +95,8 @@ class GraspEvaluator(LightningModule):
     """
 
     architecture: ClassVar[str]
+    temperature: Tensor
+    offset: Tensor
     frozen_encoder: ClassVar[bool] = False
     """Whether `encode` has nothing to train, so that its result can be kept for the next epoch and on disk."""
 
@@ -99,6 +112,9 @@ class GraspEvaluator(LightningModule):
             raise ValueError(f"optimizer {optimizer!r} is unknown; use one of {', '.join(OPTIMIZERS)}")
         self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
         self.average_decay = average_decay
+        self.register_buffer("temperature", torch.ones(()))
+        self.register_buffer("offset", torch.zeros(()))
+        self._random_state: Tensor | None = None
         metrics = MetricCollection(
             {
                 "accuracy": BinaryAccuracy(),
@@ -122,6 +138,13 @@ class GraspEvaluator(LightningModule):
         """Log-odds of success, differentiable in the grasps, which are in the frame of the view's aimed camera."""
         raise NotImplementedError
 
+    def logit_and_spread(
+        self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]
+    ) -> tuple[Float[Tensor, "view grasp"], Float[Tensor, "view grasp"]]:
+        """Log-odds, and their standard deviation among the members of an ensemble; 0 for a model alone."""
+        logit = self.logit(scene, grasps)
+        return logit, torch.zeros_like(logit)
+
     def fit_statistics(self, images: Float[Tensor, "view 2 224 224"], waypoints: Float[Tensor, "grasp 10 28"]) -> None:
         """Set what is standardised by the training data; called once, before training. Nothing by default."""
 
@@ -138,6 +161,35 @@ class GraspEvaluator(LightningModule):
         }
 
     # scoring
+
+    def probability(self, logit: Tensor) -> Tensor:
+        """Probability of success of log-odds as `logit` gives them: sigmoid(logit / temperature + offset)."""
+        return torch.sigmoid(logit / self.temperature + self.offset)
+
+    def calibrate(self, logit: Float[Tensor, " grasp"], success: Float[Tensor, " grasp"]) -> None:
+        """Fit temperature and offset by the likelihood of grasps that were not trained on.
+
+        The temperature takes back overconfidence (Guo et al. 2017); the offset brings log-odds that were learned on as
+        many successes as failures to the grasps' own rate (Platt 1999). Ranks do not change, nor does `logit`.
+        Raises ValueError unless there are both successes and failures.
+        """
+        if not 0 < success.sum() < len(success):
+            raise ValueError("calibration needs grasps that hold and grasps that fail")
+        logit, success = logit.detach().double(), success.double()
+        slope_and_offset = torch.tensor([0.0, 0.0], dtype=torch.float64, requires_grad=True)
+        optimiser = torch.optim.LBFGS([slope_and_offset], max_iter=100, line_search_fn="strong_wolfe")
+
+        def loss() -> Tensor:
+            optimiser.zero_grad()
+            log_slope, offset = slope_and_offset  # the temperature stays positive: the order is not turned
+            value = F.binary_cross_entropy_with_logits(logit * log_slope.exp() + offset, success)
+            value.backward()
+            return value
+
+        with torch.enable_grad():
+            optimiser.step(loss)
+        self.temperature.fill_((-slope_and_offset[0]).exp().item())
+        self.offset.fill_(slope_and_offset[1].item())
 
     def prepare(self, observation: Observation) -> PreparedView:
         """Encode an observation once. Any observation will do: it is aimed at the object first."""
@@ -160,11 +212,17 @@ class GraspEvaluator(LightningModule):
             prepared = self.prepare(observation)
             world = grasps.to_frame("world", observation.T_world_camera).waypoints.to(self.device)
             logits = [prepared.logit(part) for part in world.split(CHUNK)] if len(world) else [world.new_zeros(0)]
-            return torch.sigmoid(torch.cat(logits))
+            return self.probability(torch.cat(logits))
         finally:
             self.train(training)
 
     # training
+
+    def batch_logit(self, batch: Batch) -> Float[Tensor, " batch"]:
+        """Log-odds of success of a batch's grasps; each view is encoded once."""
+        views = self.encode(batch.views) if isinstance(batch.views, Tensor) else batch.views
+        scene = {name: value[batch.view] for name, value in views.items()}
+        return self.logit(scene, batch.grasps)[:, 0].float()
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         """Loss and metrics of one batch.
@@ -172,15 +230,14 @@ class GraspEvaluator(LightningModule):
         The loss is the softmax cross-entropy over {fail, success}. With two outputs l0, l1 it equals the binary
         cross-entropy with logits of the log-odds l1 - l0, which serves architectures with one output as well.
         """
-        scene = self.encode(batch.views) if isinstance(batch.views, Tensor) else batch.views
-        logit = self.logit(scene, batch.grasps)[:, 0].float()
+        logit = self.batch_logit(batch)
         loss = F.binary_cross_entropy_with_logits(logit, batch.success)
         size = len(batch.success)
-        self.log(f"{stage}_loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=size)
+        self.log(f"{stage}_loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=size, sync_dist=True)
         if stage in self.metrics:
             metrics = self.metrics[stage]
             assert isinstance(metrics, MetricCollection)
-            metrics.update(preds=logit.sigmoid(), target=batch.success.long(), indexes=batch.scene_index)
+            metrics.update(preds=self.probability(logit), target=batch.success.long(), indexes=batch.scene_index)
             self.log_dict(metrics, on_step=False, on_epoch=True, batch_size=size)
         return loss
 
@@ -198,8 +255,7 @@ class GraspEvaluator(LightningModule):
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Probabilities of success, (batch,)."""
-        scene = self.encode(batch.views) if isinstance(batch.views, Tensor) else batch.views
-        return self.logit(scene, batch.grasps)[:, 0].float().sigmoid()
+        return self.probability(self.batch_logit(batch))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Stochastic gradient descent as in the thesis, or AdamW."""
@@ -207,6 +263,20 @@ class GraspEvaluator(LightningModule):
         if self.optimizer == "sgd":
             return torch.optim.SGD(weights, lr=self.learning_rate, weight_decay=self.weight_decay)
         return torch.optim.AdamW(weights, lr=self.learning_rate, weight_decay=self.weight_decay)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep the random state, so that dropout goes on after a kill as it would have without."""
+        checkpoint["random_state"] = torch.get_rng_state()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take up the random state at the next step."""
+        self._random_state = checkpoint["random_state"]
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Set the random state that a checkpoint kept; what came between, such as making loaders, may have drawn."""
+        if self._random_state is not None:
+            torch.set_rng_state(self._random_state.cpu())
+            self._random_state = None
 
     def configure_callbacks(self) -> list[Callback]:
         """The moving average, while fitting."""

@@ -19,6 +19,11 @@ from dexzoo.resources import resource
 _MODELS = {
     "em1": "dexzoo.models.em1.EM1",
     "em2": "dexzoo.models.em2.EM2",
+    "em2_lite": "dexzoo.models.em2_lite.EM2Lite",
+    "em3": "dexzoo.models.em3.EM3",
+    "ffh": "dexzoo.models.ffh.FFH",
+    "em_fk": "dexzoo.models.em_fk.EMFK",
+    "ensemble": "dexzoo.models.ensemble.Ensemble",
 }
 _PICKLE_SUFFIXES = {".ckpt", ".pt", ".pth", ".pkl", ".pickle", ".bin"}
 _PICKLE_STARTS = (b"PK\x03\x04", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
@@ -71,10 +76,10 @@ def shipped_card(name: str) -> dict[str, Any] | None:
 def _shipped(name: str) -> Path:
     path = resource("checkpoints") / f"{name}.safetensors"
     if not path.is_file():
-        raise FileNotFoundError(
-            f"model {name} comes without weights; train them with `python -m dexzoo fit --config {name}.yaml` and load "
-            "the run's folder"
-        )
+        how = f"train them with `python -m dexzoo fit --config {name}.yaml` and load the run's folder"
+        if name == "ensemble":
+            how = "make one of trained models with Ensemble(members=[...]).save(FOLDER) and load the folder"
+        raise FileNotFoundError(f"model {name} comes without weights; {how}")
     return path
 
 
@@ -140,14 +145,19 @@ def _read_card(path: Path) -> dict[str, Any]:
 
 
 def load_weights(evaluator: GraspEvaluator, weights: dict[str, torch.Tensor], path: str | Path) -> None:
-    """Put weights into an evaluator. ValueError that names the file when they are of another architecture."""
+    """Put weights into an evaluator. ValueError that names the file when they are of another architecture or size."""
     own = evaluator.state_dict()
-    odd = sorted(set(own).symmetric_difference(weights)) or [
-        name for name in own if own[name].shape != weights[name].shape
-    ]
+    uncalibrated = {"temperature": torch.ones(()), "offset": torch.zeros(())}  # as saved before there was calibration
+    weights = uncalibrated | weights
+
+    def size(tensors: dict[str, torch.Tensor], name: str) -> str:
+        return " x ".join(map(str, tensors[name].shape)) if name in tensors else "absent"
+
+    odd = [name for name in sorted(set(own) | set(weights)) if size(own, name) != size(weights, name)]
     if odd:
         raise ValueError(
             f"{path} holds another architecture than {evaluator.architecture} as configured, by {len(odd)} tensors "
-            f"such as {odd[0]}; use the configuration that it was trained with"
+            f"such as {odd[0]}, {size(weights, odd[0])} in the file and {size(own, odd[0])} as configured; use the "
+            "configuration that it was trained with"
         )
     evaluator.load_state_dict({name: value.to(own[name].dtype) for name, value in weights.items()})

@@ -1,0 +1,28 @@
+"""EM3: EM2 with a ResNet-50."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Unpack
+
+from dexzoo.models.em2 import EM2
+from dexzoo.models.evaluator import TrainingOptions
+
+
+class EM3(EM2):
+    """EM2 with ResNet-50 in place of VGG-16: our reading of the third model of Aktas et al. (arXiv 1908.04293).
+
+    trunk: "resnet50_views", trained here on rendered views, or "resnet50", ImageNet weights fetched by torchvision.
+    The other arguments are `EM2`'s.
+    """
+
+    architecture: ClassVar[str] = "em3"
+
+    def __init__(
+        self,
+        width: int = 2048,
+        trunk: str = "resnet50_views",
+        dropout: float = 0.5,
+        gain: float = 1.0,
+        **training: Unpack[TrainingOptions],
+    ) -> None:
+        super().__init__(width, trunk, dropout, gain, **training)

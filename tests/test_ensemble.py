@@ -1,0 +1,89 @@
+"""An ensemble is the mean of its members, and knows how far they are apart."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+import torch
+from safetensors.torch import load_file
+
+from dexzoo.camera import Observation, look_at
+from dexzoo.grasp import Grasps
+from dexzoo.models import zoo
+from dexzoo.models.em_fk import EMFK
+from dexzoo.models.ensemble import Ensemble
+from dexzoo.models.ffh import FFH
+
+CENTRE = np.array([0.0, 0, 0.04])
+
+
+@pytest.fixture(scope="module")
+def members(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Two of one kind and one of another, the last with a calibration."""
+    folder = tmp_path_factory.mktemp("members")
+    torch.manual_seed(0)
+    made = [EMFK(width=16, num_blocks=1), EMFK(width=16, num_blocks=1), FFH(width=16)]
+    made[2].temperature.fill_(2.0)
+    made[2].offset.fill_(0.5)
+    return [str(model.save(folder / f"{i}.safetensors", half=False)) for i, model in enumerate(made)]
+
+
+@pytest.fixture(scope="module")
+def view() -> Observation:
+    return synthetic.render("ball", np.full(3, 0.04), CENTRE, look_at(CENTRE, 0.5, 0.3, 0.8))
+
+
+@pytest.fixture(scope="module")
+def grasps() -> Grasps:
+    return synthetic.draw_grasps(CENTRE, 6, np.random.default_rng(0))[0]
+
+
+def test_mean_and_spread_are_those_of_the_members(members: list[str], view: Observation, grasps: Grasps) -> None:
+    every = []
+    for member in members:
+        model = zoo.load(member)
+        logit = model.prepare(view).logit(grasps.waypoints)
+        every.append(logit / model.temperature + model.offset)
+    ensemble = Ensemble(members=members).eval()
+    mean, spread = ensemble.prepare(view).logit_and_spread(grasps.waypoints)
+    torch.testing.assert_close(mean, torch.stack(every).mean(0))
+    torch.testing.assert_close(spread, torch.stack(every).std(0, correction=0))
+    torch.testing.assert_close(ensemble.score(view, grasps), mean.sigmoid())
+
+
+def test_spread_has_a_slope_even_where_members_agree(members: list[str], view: Observation, grasps: Grasps) -> None:
+    for names, varies in (([members[0]] * 2, False), (members, True)):
+        waypoints = grasps.waypoints.clone().requires_grad_()
+        _, spread = Ensemble(members=names).eval().prepare(view).logit_and_spread(waypoints)
+        (slope,) = torch.autograd.grad(spread.sum(), waypoints, allow_unused=True)
+        assert torch.isfinite(slope).all()
+        assert bool(slope.any()) == varies
+
+
+def test_a_model_alone_has_no_spread(members: list[str], view: Observation, grasps: Grasps) -> None:
+    prepared = zoo.load(members[0]).prepare(view)
+    logit, spread = prepared.logit_and_spread(grasps.waypoints)
+    torch.testing.assert_close(logit, prepared.logit(grasps.waypoints))
+    assert not spread.any()
+
+
+def test_a_saved_ensemble_is_a_list_of_members(
+    members: list[str], view: Observation, grasps: Grasps, tmp_path: Path
+) -> None:
+    ensemble = Ensemble(members=members).eval()
+    ensemble.calibrate(torch.tensor([-1.0, 0.5, 1.0, 2.0]), torch.tensor([0.0, 1, 0, 1]))
+    path = ensemble.save(tmp_path)
+    assert set(load_file(path)) == {"temperature", "offset"}
+    again = zoo.load(tmp_path)
+    assert again.arguments["members"] == members
+    torch.testing.assert_close(again.score(view, grasps), ensemble.score(view, grasps))
+
+
+def test_members_that_are_not_there_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"weights .*gone\.safetensors do not exist"):
+        Ensemble(members=[str(tmp_path / "gone.safetensors")])
+    with pytest.raises(ValueError, match="needs at least one member"):
+        Ensemble(members=[])
+    with pytest.raises(FileNotFoundError, match=r"make one of trained models with Ensemble\(members="):
+        zoo.load("ensemble")

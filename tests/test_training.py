@@ -1,0 +1,147 @@
+"""Training goes on after a kill, is shared among processes, and ends in honest probabilities."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+import torch
+from safetensors.torch import load_file
+
+import dexzoo
+from dexzoo import training
+from dexzoo.data.datamodule import BalancedBatches
+from dexzoo.models.em2 import EM2
+from dexzoo.models.evaluator import GraspEvaluator
+
+# 160 training grasps in batches of 32 make five steps an epoch; a checkpoint every four lies in mid-epoch.
+STEPS = [
+    "--config=smoke.yaml",
+    "--model.width=32",
+    "--trainer.val_check_interval=3",
+    "--trainer.max_steps=12",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthetic.write(tmp_path_factory.mktemp("grasps"))
+
+
+@pytest.fixture
+def arguments(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.chdir(tmp_path)
+    return ["fit", *STEPS, "--json", "--data.folder", str(folder), "--data.cache", str(tmp_path / "cache")]
+
+
+def fit(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> Path:
+    training.main(arguments)
+    return Path(json.loads(capsys.readouterr().out)["weights"]).parent
+
+
+def test_a_killed_run_goes_on_to_the_same_weights(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = fit(arguments, capsys)
+    step = EM2.training_step
+
+    def killed(self: EM2, batch: object, batch_idx: int) -> torch.Tensor:
+        if self.trainer.global_step == 11:
+            raise KeyboardInterrupt("killed")
+        return step(self, batch, batch_idx)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(EM2, "training_step", killed)
+        with pytest.raises(SystemExit):  # what Lightning makes of an interrupt
+            training.main(arguments)
+    capsys.readouterr()
+    left = Path("runs/smoke/version_1/checkpoints/last.ckpt")
+    assert torch.load(left, weights_only=True)["global_step"] == 8
+    resumed = fit([*arguments, "--ckpt_path", str(left)], capsys)
+    first, second = (torch.load(run / "checkpoints" / "last.ckpt", weights_only=True) for run in (whole, resumed))
+    assert first["global_step"] == second["global_step"] == 12
+    for part in ("state_dict", "current_model_state"):
+        assert first[part].keys() == second[part].keys()
+        assert all(torch.equal(value, second[part][name]) for name, value in first[part].items())
+    ends = [load_file(run / "em2.safetensors") for run in (whole, resumed)]
+    assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
+
+
+def test_balanced_batches_are_balanced_and_go_on() -> None:
+    rng = np.random.default_rng(0)
+    view = torch.tensor(rng.integers(0, 50, 2000))
+    success = torch.tensor(rng.random(2000) < 0.1).float()
+    for together in (1, 8):
+        batches = BalancedBatches(success, view, 64, together, seed=3)
+        assert len(batches) == 32
+        drawn = [row for _ in range(40) for batch in batches for row in batch]
+        assert float(success[drawn].mean()) == pytest.approx(0.5, abs=0.02)
+        # within a class each grasp is as likely as any other: counts are about 0.5 * draws / size of the class
+        count = np.bincount(drawn, minlength=2000)
+        for label in (0, 1):
+            expected = 0.5 * len(drawn) / int((success == label).sum())
+            assert count[success.numpy() == label].mean() == pytest.approx(expected, rel=0.05)
+            assert count[success.numpy() == label].min() > 0
+        other = BalancedBatches(success, view, 64, together, seed=3)
+        other.drawn = 7
+        again = BalancedBatches(success, view, 64, together, seed=3)
+        assert next(iter(other)) == list(again)[7]
+    shown = [len(view[batch].unique()) for batch in BalancedBatches(success, view, 64, 8)]
+    assert max(shown) <= 8
+
+
+def test_processes_share_batches() -> None:
+    success, view = (torch.arange(100) % 2).float(), torch.arange(100) // 10
+    whole = list(BalancedBatches(success, view, 7, 2))
+    parts = [list(BalancedBatches(success, view, 7, 2, rank=rank, world_size=2)) for rank in (0, 1)]
+    assert [a + b for a, b in zip(*parts, strict=True)] == whole
+
+
+class Alone(GraspEvaluator):
+    architecture = "alone"
+
+
+def test_calibration_finds_what_made_the_labels() -> None:
+    generator = torch.Generator().manual_seed(0)
+    logit = 4 * torch.randn(20_000, generator=generator)
+    success = torch.bernoulli(torch.sigmoid(logit / 2.5 - 0.8), generator=generator)
+    model = Alone()
+    before = model.probability(logit)
+    assert torch.equal(before, logit.sigmoid())
+    model.calibrate(logit, success)
+    assert float(model.temperature) == pytest.approx(2.5, rel=0.05)
+    assert float(model.offset) == pytest.approx(-0.8, abs=0.05)
+    p = model.probability(logit)
+    for low in np.arange(0, 1, 0.1):
+        here = (p >= low) & (p < low + 0.1)
+        assert float(p[here].mean()) == pytest.approx(float(success[here].mean()), abs=0.04)
+    assert (p[logit.argsort()].diff() >= 0).all()
+
+
+def test_calibration_needs_both_outcomes_and_survives_the_perfect() -> None:
+    logit = torch.linspace(-2, 2, 50)
+    with pytest.raises(ValueError, match="calibration needs grasps that hold and grasps that fail"):
+        Alone().calibrate(logit, torch.ones(50))
+    model = Alone()
+    model.calibrate(logit, (logit > 0).float())
+    assert torch.isfinite(model.probability(logit)).all()
+    assert float(model.temperature) > 0
+
+
+@pytest.mark.slow
+def test_two_processes_learn_as_one(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    dry = ["--model.dropout=0", "--trainer.precision=32"]  # each process draws its own dropout
+    training.main([*arguments, *dry])
+    one = json.loads(capsys.readouterr().out)["metrics"]
+    two = ["--trainer.accelerator=cpu", "--trainer.devices=2", "--trainer.strategy=ddp"]
+    command = [sys.executable, "-m", "dexzoo", *arguments, *dry, *two]
+    environment = {**os.environ, "PYTHONPATH": str(Path(dexzoo.__file__).parent.parent)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    both = json.loads(done.stdout.strip().splitlines()[-1])["metrics"]
+    for name in ("validation_loss", "validation_auroc", "validation_top1"):
+        assert both[name] == pytest.approx(one[name], abs=2e-3)
