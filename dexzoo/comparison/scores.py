@@ -135,7 +135,7 @@ def model_scores(model: GraspEvaluator, dataset: GraspDataset, title: str) -> Sc
         logit[rows] = model.logit(scene, dataset.grasps[rows][None].to(model.device))[0].float().cpu()
     if wrong := int((~logit.isfinite()).sum()):
         raise ValueError(f"{title}: {wrong} of {len(logit)} scores are nan or infinite; the weights are of no use")
-    return Scores(logit.numpy(), 0.5, logit.sigmoid().numpy())
+    return Scores(logit.numpy(), 0.5, model.probability(logit).numpy())
 
 
 def likelihood_scores(labels: Labels, validation: Labels | None) -> Scores | None:
