@@ -50,10 +50,11 @@ def cost(growth: dict[str, Any], path: Path) -> None:
         for key, label in (("processor_seconds", "processor time"), ("seconds", "wall time")):
             axes.plot(size, [row[key] for row in growth[name]], marker="o", label=label)
         axes.axhline(5, color="black", linestyle="--", linewidth=1, label="5 s")
-        axes.set(xscale="log", xlabel=name, ylim=(0, None))
+        axes.set(xscale="log", xlabel=name)
         axes.set_xticks(size, [f"{value:,}" for value in size], minor=False)
         axes.minorticks_off()
         axes.grid(alpha=0.3)
+    panels[0].set_ylim(0)  # once both are drawn
     panels[0].set_ylabel(f"seconds a view, threads: {growth['threads']}")
     panels[0].legend(fontsize=8)
     written(figure, path)
