@@ -39,7 +39,8 @@ class _Constants(NamedTuple):
 class Hand(nn.Module):
     """A differentiable hand. Angles are radians, lengths metres, poses in the palm frame.
 
-    joint_names: the 20 joints in posture order; freedoms: the 15 that move by themselves.
+    joint_names: the 20 joints in posture order; freedoms: the 15 that move by themselves; fingers: in the order of the
+    freedoms, whose names begin with theirs.
     link_names: the links in the order of `forward_kinematics`; solid_names: those with a shape, in the order of
     `signed_distance`; shapes: the primitives in the order of `shape_poses`; self_pairs: the pairs of solid links in the
     order of `self_distance`; pad_names: the fingers in the order of `pads`.
@@ -54,6 +55,7 @@ class Hand(nn.Module):
         self.joint_names = list(spec.joint_names)
         self.link_names = list(spec.link_names)
         self.freedoms = list(spec.freedoms)
+        self.fingers = list(dict.fromkeys(name.split("_")[0] for name in self.freedoms))
         self.pad_names = list(spec.pads)
         self.free_index = [self.joint_names.index(name) for name in self.freedoms]
         joints = [spec.joint(name) for name in spec.joint_names]

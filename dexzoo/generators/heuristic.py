@@ -83,7 +83,6 @@ class HeuristicGenerator(GraspGenerator):
     def __init__(self, num_samples: int = 3000) -> None:
         self.num_samples = num_samples
         self.hand: Hand = default_hand()
-        self.fingers = list(dict.fromkeys(name.split("_")[0] for name in self.hand.freedoms))
 
     def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
         """Up to `num_grasps` grasps in the camera frame, those with the best opposition first.
@@ -220,7 +219,7 @@ class HeuristicGenerator(GraspGenerator):
         touched = torch.zeros(count, 5, dtype=torch.long)
         contact = torch.zeros(count, 5, dtype=torch.bool)
         rows = torch.arange(count)
-        for index, finger in enumerate(self.fingers):
+        for index, finger in enumerate(self.hand.fingers):
             solids = [i for i, name in enumerate(self.hand.solid_names) if name.startswith(finger)]
             gap, which = distance[:, :, solids].min(-1)
             hit = gap < 0.001
@@ -243,7 +242,7 @@ class HeuristicGenerator(GraspGenerator):
         pregrasp = wrist[:, :3, 3] + rotation.rotate(quaternion, back)
         pregrasp[:, 2] = torch.maximum(pregrasp[:, 2], wrist[:, 2, 3])
         position = torch.stack((pregrasp, wrist[:, :3, 3], wrist[:, :3, 3]), 1)
-        finger = [self.fingers.index(name.split("_")[0]) for name in hand.freedoms]
+        finger = [self.hand.fingers.index(name.split("_")[0]) for name in hand.freedoms]
         flexes = torch.tensor([not name.endswith("_abd") for name in hand.freedoms])
         press = SQUEEZE * (contact[:, finger] & flexes)
         squeeze = hand.clamp(grip + press)

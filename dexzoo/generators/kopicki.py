@@ -127,11 +127,10 @@ class Way:
         self.points = _some(cloud, NUM_POINTS, generator)
         self.others = _some(others, NUM_POINTS, generator)
         self.surface = cloud
-        fingers = list(dict.fromkeys(name.split("_")[0] for name in hand.freedoms))
-        self.finger_solids = [[i for i, n in enumerate(hand.solid_names) if n.startswith(f)] for f in fingers]
+        self.finger_solids = [[i for i, n in enumerate(hand.solid_names) if n.startswith(f)] for f in hand.fingers]
         touching = [{hand.link_names[model.link].split("_")[0] for model in row} for row in models]
-        cost = torch.tensor([THUMB_GAP_COST if finger == "thumb" else FINGER_GAP_COST for finger in fingers])
-        self.gap_weight = cost * torch.tensor([[finger in row for finger in fingers] for row in touching])
+        cost = torch.tensor([THUMB_GAP_COST if finger == "thumb" else FINGER_GAP_COST for finger in hand.fingers])
+        self.gap_weight = cost * torch.tensor([[finger in row for finger in hand.fingers] for row in touching])
         self.types = torch.tensor([d.grasp_type for d in demonstrations])
         keys = torch.cat([d.grasp.waypoints[:, [PREGRASP, GRIP, SQUEEZE]] for d in demonstrations])
         poses = pose_matrix(keys[..., :3], keys[..., 3:7])

@@ -69,9 +69,8 @@ def _read(name: str, entry: dict[str, Any], hand: Hand, where: str) -> Preshape:
     try:
         wrist = entry["wrist"]
         quaternion = rotation.normalize(torch.tensor(wrist["quaternion"], dtype=torch.float32))
-        fingers = dict.fromkeys(joint.split("_")[0] for joint in hand.freedoms)
         postures = [
-            torch.tensor([angle for finger in fingers for angle in entry[key][finger]], dtype=torch.float32)
+            torch.tensor([angle for finger in hand.fingers for angle in entry[key][finger]], dtype=torch.float32)
             for key in ("open", "closed")
         ]
         direction = torch.tensor(entry["approach"], dtype=torch.float32)
@@ -98,7 +97,7 @@ def close(preshape: Preshape, mesh: trimesh.Trimesh, hand: Hand) -> Grasps:
     if not len(cloud) or not _distance(preshape, preshape.opened[None], cloud, hand).min() > -_TOLERANCE:
         raise ValueError(f"{where}: the open hand is in the object or out of reach of it; move the wrist")
     grip, touching = preshape.opened.clone(), list[str]()
-    for finger in dict.fromkeys(name.split("_")[0] for name in hand.freedoms):
+    for finger in hand.fingers:
         joints = [i for i, name in enumerate(hand.freedoms) if name.startswith(finger)]
         links = [i for i, name in enumerate(hand.solid_names) if name.startswith(finger)]
         grip, touched = _bend(preshape, grip, joints, links, cloud, hand)
