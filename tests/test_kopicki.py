@@ -1,5 +1,7 @@
 """The Kopicki generator: feasible, alike for the same seed, and plain about what it cannot do."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -8,8 +10,9 @@ from dexzoo.camera import Camera, Observation, look_at
 from dexzoo.generators import list_generators, make_generator
 from dexzoo.generators.demonstration import SHIPPED, load_demonstrations
 from dexzoo.generators.density import Grips
-from dexzoo.generators.kopicki import KopickiGenerator, Way, obstacles
+from dexzoo.generators.kopicki import KopickiGenerator, Way
 from dexzoo.generators.search import anneal, climb
+from dexzoo.generators.surroundings import obstacles, underneath
 from dexzoo.grasp import GRIP, Grasps
 from dexzoo.hand import Hand
 from dexzoo.sim import Scene
@@ -67,8 +70,8 @@ def test_annealing_and_gradient_both_raise_the_likelihood(generator: KopickiGene
     density = generator.density(can_view, seed=0)
     grips = density.sample(40, torch.Generator().manual_seed(0))
 
-    def free(grips: Grips) -> torch.Tensor:
-        return torch.zeros(len(grips.demo))
+    def free(_: Grips) -> Callable[[Grips], torch.Tensor]:
+        return lambda grips: torch.zeros(len(grips.demo))
 
     before = density.log_likelihood(grips).mean()
     annealed = anneal(density, grips, free, 60, torch.Generator().manual_seed(1))
@@ -124,6 +127,38 @@ def test_the_support_of_an_object_is_an_obstacle() -> None:
     assert len(seen) > 5
     local = seen @ torch.tensor(scene.support.pose[:3, :3], dtype=torch.float32)
     assert (local[:, :2].abs() < torch.tensor(scene.support.half[:2]) + 0.015).all()
+
+
+@pytest.mark.parametrize("name", ["plate_05", "knife_02"])
+def test_what_carries_an_object_is_guessed_to_be_under_its_middle(name: str, generator: KopickiGenerator) -> None:
+    scene = Scene.place(make_object(name), seed=0)
+    support = scene.support
+    assert support is not None
+    guess = underneath(generator.density(scene.observe(seed=1)).surface.points)
+    low, half = guess[guess[:, 2] < 0.015], torch.tensor(support.half)
+    local = (low @ torch.tensor(support.pose[:3, :3], dtype=torch.float32))[:, :2]
+    inside = (local.abs() < half[:2] + 0.01).all(-1)
+    assert inside.float().mean() > 0.5, "most of it is where the block is"
+    assert (local[inside].abs().amax(0) > half[:2] - 0.01).all(), "and reaches as far"
+    assert float(guess[:, 2].max()) == pytest.approx(2 * float(half[2]), abs=0.01)
+
+
+def test_nothing_is_guessed_under_what_stands_on_the_table(generator: KopickiGenerator, can_view: Observation) -> None:
+    assert not len(underneath(generator.density(can_view).surface.points))
+
+
+def test_the_cost_by_the_nearest_points_is_that_by_all(generator: KopickiGenerator) -> None:
+    scene = Scene.place(make_object("scissors_02"), seed=0)
+    view = scene.observe(seed=1)
+    density = generator.density(view)
+    others = obstacles(view)
+    way = Way(
+        generator.demonstrations, generator.models, generator.hand, density.surface.points, others, torch.Generator()
+    )
+    grips = density.sample(60, torch.Generator().manual_seed(0))
+    full = way.table_cost(grips)
+    assert (full > way.table_cost(grips, others[:0])).any(), "some grips touch the block and not the table"
+    torch.testing.assert_close(way.table_cost_near(grips)(grips), full)
 
 
 def test_what_cannot_be_grasped_is_said(generator: KopickiGenerator, can_view: Observation) -> None:

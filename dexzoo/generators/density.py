@@ -10,7 +10,6 @@ orientations, which takes q and -q as one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -51,6 +50,8 @@ REFERENCE_KERNELS = 5000
 """Kernels that a query density's weights add up to, however many it is made of; Kopicki's number."""
 FLOOR = 6e-6
 """Likelihood under which a link counts as away from the surface: that at three and a half bandwidths."""
+LINK_POWER = 0.75
+"""The sum over n links counts divided by n to this power: they move together, so that n are not n witnesses."""
 _CHUNK = 256
 
 
@@ -180,7 +181,7 @@ class GraspDensity:
         wrist = pose_matrix(position, rotation.normalize(quaternion)) @ torch.linalg.inv(relative)
         return Grips(rows, wrist, free)
 
-    def screen(self, grips: Grips, num: int = 250) -> Float[Tensor, " grip"]:
+    def screen(self, grips: Grips, num: int = 150) -> Float[Tensor, " grip"]:
         """A quick estimate of the likelihood, from the first `num` kernels, which are as random as the rest."""
         position, turn = self._link_poses(grips)
         total = self.log_posture(grips)
@@ -193,11 +194,11 @@ class GraspDensity:
                     position[rows, column], turn[rows, column], self.kernel_position[demo, column, :num],
                     self.kernel_turn[demo, column, :num], self.widths,
                 )  # fmt: skip
-                total[rows] += self._saturated(logs.logsumexp(-1) + scale) / math.sqrt(len(columns))
+                total[rows] += self._saturated(logs.logsumexp(-1) + scale) / len(columns) ** LINK_POWER
         return total
 
     @torch.no_grad()
-    def neighbours(self, grips: Grips, num: int = 24) -> tuple[Tensor, Tensor, Tensor]:
+    def neighbours(self, grips: Grips, num: int = 12) -> tuple[Tensor, Tensor, Tensor]:
         """The kernels that matter near each grip: positions (n, l, num, 3), turns (.., 9), ln weights (n, l, num).
 
         A kernel five bandwidths away weighs e^-25: so few are enough, and they serve as long as the grip stays near.
@@ -240,7 +241,7 @@ class GraspDensity:
         cosine = (((near[1] * turn[..., None, :]).sum(-1) + 1) / 4).clamp_min(1e-6).sqrt()
         logs = near[2] - apart - self.widths.concentration * (1 - cosine)
         active = self.active[grips.demo]
-        contact = torch.where(active, self._saturated(logs.logsumexp(-1)), 0.0).sum(-1) / active.sum(-1).sqrt()
+        contact = torch.where(active, self._saturated(logs.logsumexp(-1)), 0.0).sum(-1) / active.sum(-1) ** LINK_POWER
         return contact + self.log_posture(grips)
 
     def _saturated(self, log_link: Tensor) -> Tensor:
@@ -266,10 +267,12 @@ class GraspDensity:
 
     def _link_poses(self, grips: Grips) -> tuple[Tensor, Tensor]:
         """Positions (n, l, 3) and rotation matrices (n, l, 9) of the links in contact."""
-        relative = self.hand.forward_kinematics(self.hand.expand(grips.joints))
-        rows = torch.arange(len(grips.demo))[:, None]
-        poses = grips.wrist[:, None] @ relative[rows, self.links[grips.demo]]
-        return poses[..., :3, 3], poses[..., :3, :3].flatten(-2)
+        links = self.hand.forward_kinematics(self.hand.expand(grips.joints))[..., :3, :]
+        relative = torch.take_along_dim(links, self.links[grips.demo][..., None, None], 1)
+        # one product for all links of a grip, which is far quicker than one for each
+        turned = grips.wrist[:, :3, :3] @ relative.transpose(1, 2).flatten(-2)
+        turned = turned.unflatten(-1, (-1, 4)).transpose(1, 2)
+        return turned[..., 3] + grips.wrist[:, None, :3, 3], turned[..., :3].flatten(-2)
 
 
 def _log_kernel(

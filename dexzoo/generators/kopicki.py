@@ -6,11 +6,13 @@ on the way. Each carries its demonstration's approach and squeeze.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from dexzoo import rotation
@@ -20,9 +22,9 @@ from dexzoo.generators.density import Bandwidths, ContactModel, GraspDensity, Gr
 from dexzoo.generators.features import Features
 from dexzoo.generators.generator import MAX_REACH, MIN_CLEARANCE, GraspGenerator, spread
 from dexzoo.generators.search import anneal, climb
+from dexzoo.generators.surroundings import obstacles, underneath
 from dexzoo.grasp import GRIP, PREGRASP, SQUEEZE, Grasps, pose_matrix
 from dexzoo.hand import Hand, default_hand
-from dexzoo.segmentation import MAX_DEPTH, MIN_HEIGHT
 
 NUM_FEATURES = 1000
 COLLISION_STEPS, COLLISION_WEIGHTS = (0.0, 0.4, 0.7, 0.9), (1.0, 1.0, 0.5, 0.2)
@@ -35,6 +37,8 @@ THUMB_GAP_COST, FINGER_GAP_COST = 300.0, 100.0
 NUM_CLIMBED = 500
 """Grips that are improved to the end; twice as many are at first."""
 NUM_POINTS = 300
+NUM_NEAR = 12
+"""Points of what else stands on the table that are looked at while a grip is improved."""
 TABLE_COST = 1000.0
 """Log-likelihood that a metre below the least clearance costs."""
 
@@ -53,7 +57,7 @@ class KopickiGenerator(GraspGenerator):
         demonstrations: Sequence[Demonstration] | None = None,
         num_per_type: int = 20,
         num_samples: int = 30_000,
-        num_kernels: int = 50_000,
+        num_kernels: int = 30_000,
         widths: Bandwidths | None = None,
         search: Literal["gradient", "annealing"] = "gradient",
         num_steps: tuple[int, int] = (20, 40),
@@ -87,18 +91,22 @@ class KopickiGenerator(GraspGenerator):
             raise ValueError(f"num_grasps is {num_grasps}, expected at least 1")
         generator = torch.Generator().manual_seed(seed)
         density = self.density(observation, seed)
-        way = Way(
-            self.demonstrations, self.models, self.hand, density.surface.points, obstacles(observation), generator
-        )
+        surface = density.surface.points
+        others = torch.cat((obstacles(observation), underneath(surface)))
+        way = Way(self.demonstrations, self.models, self.hand, surface, others, generator)
         share = max(NUM_CLIMBED // len(self.demonstrations), 8)
         with torch.no_grad():
             grips = density.sample(self.num_samples, generator)
-            grips = grips[best(density.screen(grips) - way.table_cost(grips), grips.demo, 2 * share)]
+            value = density.screen(grips) - way.table_cost(grips, way.others[:0])
+            # what else stands on the table takes long to look at
+            kept = best(value, grips.demo, 8 * share)
+            grips, value = grips[kept], value[kept]
+            grips = grips[best(value - way.table_cost(grips), grips.demo, 2 * share)]
         for num_steps in self.num_steps:
             if self.search == "gradient":
-                grips = climb(density, grips, way.table_cost, num_steps)
+                grips = climb(density, grips, way.table_cost_near, num_steps)
             else:
-                grips = anneal(density, grips, way.table_cost, num_steps, generator)
+                grips = anneal(density, grips, way.table_cost_near, num_steps, generator)
             with torch.no_grad():
                 value = density.log_likelihood(grips) - way.cost(grips) - way.gap_cost(grips)
             kept = best(value, grips.demo, share)
@@ -125,7 +133,7 @@ class Way:
     ) -> None:
         self.hand = hand
         self.points = _some(cloud, NUM_POINTS, generator)
-        self.others = _some(others, NUM_POINTS, generator)
+        self.others = _some(others, 2 * NUM_POINTS, generator)
         self.surface = cloud
         self.finger_solids = [[i for i, n in enumerate(hand.solid_names) if n.startswith(f)] for f in hand.fingers]
         touching = [{hand.link_names[model.link].split("_")[0] for model in row} for row in models]
@@ -150,15 +158,25 @@ class Way:
         joints = torch.stack((shown[:, 0], grips.joints, self.hand.clamp(grips.joints + shown[:, 2] - shown[:, 1])), 1)
         return torch.cat((start[:, None], wrist[:, 1:]), 1), joints
 
-    def table_cost(self, grips: Grips) -> Tensor:
-        """Log-likelihood that links too near to the table cost, at the pre-grasp and at the grip."""
-        low = self._clearance(grips, (0.0, 1.0))
-        return TABLE_COST * (2 * MIN_CLEARANCE - low).clamp_min(0).sum(-1)
+    def table_cost(self, grips: Grips, others: Tensor | None = None) -> Tensor:
+        """Log-likelihood that links too near to the table cost at the grip, where the hand is lowest.
+
+        others: (n, 3) or (grip, n, 3) points of what else stands on it; all of them if not given.
+        """
+        low = self._clearance(grips.wrist, self._links(grips), self.others if others is None else others)
+        return TABLE_COST * (2 * MIN_CLEARANCE - low).clamp_min(0)
+
+    def table_cost_near(self, grips: Grips) -> Callable[[Grips], Tensor]:
+        """`table_cost` for grips that stay near these ones, by the nearest points alone."""
+        distance = self.hand.signed_distance(self._links(grips), _in_palm(grips.wrist, self.others)).amin(-2)
+        nearest = distance.topk(min(NUM_NEAR, len(self.others)), largest=False, sorted=False).indices
+        return partial(self.table_cost, others=self.others[nearest])
 
     def cost(self, grips: Grips) -> Tensor:
         """Kopicki's cost of collisions with the observed points on the way, besides that of the table."""
-        links = self._links(grips, COLLISION_STEPS)
-        depth = (-self.hand.signed_distance(links, self.points).amin(-2)).clamp_min(0)
+        wrist, links = self._path(grips, COLLISION_STEPS)
+        distance = self.hand.signed_distance(links, _in_palm(wrist, self.points))
+        depth = (-distance.amin(-2)).clamp_min(0)
         weight = torch.tensor(COLLISION_WEIGHTS)[:, None]
         return self.table_cost(grips) + (weight * (torch.expm1(100 * depth))).sum((-1, -2)) * COLLISION_COST
 
@@ -167,15 +185,16 @@ class Way:
 
         The product of experts knows where links may be, but only as sharply as its kernels are wide.
         """
-        links = grips.wrist[:, None] @ self.hand.forward_kinematics(self.hand.expand(grips.joints))
-        parts = [self.hand.signed_distance(part, self.surface).amin(-1) for part in links.split(64)]
+        pairs = zip(self._links(grips).split(64), grips.wrist.split(64), strict=True)
+        parts = [self.hand.signed_distance(links, _in_palm(wrist, self.surface)).amin(-1) for links, wrist in pairs]
         gap = torch.stack([torch.cat(parts)[:, solids].amin(-1) for solids in self.finger_solids], -1)
         return (self.gap_weight[grips.demo] * gap.abs()).sum(-1)
 
     def feasible(self, grips: Grips) -> Tensor:
         """(n,) whether every link keeps clear of the table all the way."""
         with torch.no_grad():
-            return self._clearance(grips, tuple(np.linspace(0, 1, 7))).amin(-1) > MIN_CLEARANCE
+            path = self._path(grips, np.linspace(0, 1, 7).tolist())
+            return self._clearance(*path, self.others).amin(-1) > MIN_CLEARANCE
 
     def grasps(self, grips: Grips, log_likelihood: Tensor) -> Grasps:
         """The grips with their paths, in the world frame."""
@@ -189,33 +208,38 @@ class Way:
             log_likelihood,
         )
 
-    def _links(self, grips: Grips, at: Sequence[float]) -> Tensor:
-        """(n, step, link, 4, 4) link poses on the way, at fractions of it from the pre-grasp to the grip."""
+    def _links(self, grips: Grips) -> Tensor:
+        """(n, link, 4, 4) link poses at the grip, in the palm frame."""
+        return self.hand.forward_kinematics(self.hand.expand(grips.joints))
+
+    def _path(self, grips: Grips, at: Sequence[float]) -> tuple[Tensor, Tensor]:
+        """Wrist poses (n, step, 4, 4), and link poses in the palm frame (n, step, link, 4, 4) on the way.
+
+        at: fractions of it from the pre-grasp to the grip.
+        """
         wrist, joints = self.keyframes(grips)
         t = wrist.new_tensor(at)[:, None]
         place = torch.lerp(wrist[:, :1, :3, 3], wrist[:, 1:2, :3, 3], t)
         quaternion = rotation.from_matrix(wrist[:, :2, :3, :3])
         turn = rotation.slerp(quaternion[:, :1], quaternion[:, 1:], t[:, 0].expand(len(place), -1))
         posture = torch.lerp(joints[:, :1], joints[:, 1:2], t)
-        return pose_matrix(place, turn)[:, :, None] @ self.hand.forward_kinematics(self.hand.expand(posture))
+        return pose_matrix(place, turn), self.hand.forward_kinematics(self.hand.expand(posture))
 
-    def _clearance(self, grips: Grips, at: Sequence[float]) -> Tensor:
-        """(n, step) metres to the table, or to what else is seen on it."""
-        links = self._links(grips, at)
-        clearance = self.hand.clearance(links, grips.wrist.new_tensor([0.0, 0.0, 1.0, 0.0])).amin(-1)
-        if len(self.others):
-            clearance = torch.minimum(clearance, self.hand.signed_distance(links, self.others).amin((-1, -2)))
-        return clearance
+    def _clearance(self, wrist: Tensor, links: Tensor, others: Tensor) -> Tensor:
+        """Metres from the lowest link to the table, or from the nearest one to the other points.
+
+        wrist: (*batch, 4, 4) poses. links: (*batch, link, 4, 4) in the palm frame.
+        """
+        # the third row of a pose is the table's plane in the palm frame
+        clearance = self.hand.clearance(links, wrist[..., 2, :]).amin(-1)
+        if not others.shape[-2]:
+            return clearance
+        return torch.minimum(clearance, self.hand.signed_distance(links, _in_palm(wrist, others)).amin((-1, -2)))
 
 
-def obstacles(observation: Observation) -> Tensor:
-    """(n, 3) what is seen above the table besides the object, in the world frame, one point in each centimetre."""
-    other = (observation.height > MIN_HEIGHT) & (observation.depth < MAX_DEPTH) & ~observation.mask
-    cloud = observation.camera.directions()[other] * observation.depth[other][:, None]
-    T = observation.T_world_camera
-    points = cloud @ T[:3, :3].T + T[:3, 3]
-    _, first = np.unique(np.floor(points / 0.01), axis=0, return_index=True)
-    return torch.tensor(points[first], dtype=torch.float32)
+def _in_palm(wrist: Tensor, points: Tensor) -> Float[Tensor, "*batch point 3"]:
+    """Points (*batch, n, 3) in the palm frames of wrist poses (*batch, 4, 4)."""
+    return (points - wrist[..., None, :3, 3]) @ wrist[..., :3, :3]
 
 
 def _some(points: Tensor, num: int, generator: torch.Generator) -> Tensor:

@@ -22,10 +22,11 @@ RATES = (0.002, 0.02, 0.01)
 REFRESH = 25
 """Steps for which the neighbouring kernels of a grip are kept."""
 
-Cost = Callable[[Grips], Tensor]
+CostNear = Callable[[Grips], Callable[[Grips], Tensor]]
+"""Given grips, their cost as a function that serves as long as they stay near."""
 
 
-def climb(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int) -> Grips:
+def climb(density: GraspDensity, grips: Grips, cost_near: CostNear, num_steps: int) -> Grips:
     """Gradient ascent (Adam) on ln likelihood - cost, over the wrist's tangent space and the free joints."""
     tangent = torch.zeros(len(grips.demo), 6, requires_grad=True)
     change = torch.zeros_like(grips.joints, requires_grad=True)
@@ -36,11 +37,10 @@ def climb(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int) -> Gr
         joints = density.hand.clamp(grips.joints + RATES[2] * change)
         return Grips(grips.demo, step_pose(grips.wrist, scale * tangent), joints)
 
-    near = density.neighbours(grips)
     for step in range(num_steps):
-        if step and step % REFRESH == 0:
+        if step % REFRESH == 0:
             with torch.no_grad():
-                near = density.neighbours(moved())
+                near, cost = density.neighbours(moved()), cost_near(moved())
         for group in optimizer.param_groups:
             group["lr"] = 1 - 0.9 * step / num_steps
         optimizer.zero_grad()
@@ -52,16 +52,16 @@ def climb(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int) -> Gr
         return moved()
 
 
-def anneal(density: GraspDensity, grips: Grips, cost: Cost, num_steps: int, generator: torch.Generator) -> Grips:
+def anneal(
+    density: GraspDensity, grips: Grips, cost_near: CostNear, num_steps: int, generator: torch.Generator
+) -> Grips:
     """Simulated annealing as Kopicki's: the temperature falls linearly from 1 to 0.1, and with it the steps."""
     count = len(grips.demo)
-    near = density.neighbours(grips)
-    value = density.log_likelihood(grips, near) - cost(grips)
     rng = np.random.default_rng(int(torch.randint(2**31, (1,), generator=generator)))
     for step in range(num_steps):
         heat = 1 - 0.9 * step / max(num_steps - 1, 1)
-        if step and step % REFRESH == 0:
-            near = density.neighbours(grips)
+        if step % REFRESH == 0:
+            near, cost = density.neighbours(grips), cost_near(grips)
             value = density.log_likelihood(grips, near) - cost(grips)
         shift = heat * WRIST_STEP * torch.randn(count, 3, generator=generator)
         turn = vonmises_fisher([1.0, 0, 0, 0], TURN_CONCENTRATION).rvs(count, random_state=rng)
