@@ -44,7 +44,7 @@ MESH_MASS, MESH_FRICTION = 0.2, 0.7
 """Of objects that dexzoo did not make, whose own are not known."""
 ORIGINAL_STEPS = (50, 450)
 """Kopicki's steps of annealing before and after the best are chosen."""
-KERNELS, SAMPLES = (5_000, 15_000, 50_000, 150_000), (1_000, 3_000, 10_000, 30_000)
+KERNELS, SAMPLES = (3_000, 10_000, 30_000, 100_000), (1_000, 3_000, 10_000, 30_000)
 NUM_GROWTH = 3
 FORGET_PEAK = Path("/proc/self/clear_refs")
 """Where Linux is told to count the most memory held anew."""
