@@ -14,13 +14,14 @@ import torch
 import trimesh
 from safetensors.torch import save_file
 
-from dexzoo import cli, planning
+from dexzoo import cli, commands, planning
 from dexzoo.camera import Observation
 from dexzoo.comparison import scores
 from dexzoo.data import collect as collecting
 from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import GRASP_TYPES, Grasps
 from dexzoo.models.em2 import EM2
+from dexzoo.models.zoo import list_models
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -101,7 +102,12 @@ def test_plan_writes_a_folder(run: Run, frame: Path, weights: Path, tmp_path: Pa
     status, text, err = run("plan", *observation, "--num_grasps", 8, "--refine", "--out", out)
     assert (status, err) == (0, "")
     assert "the ten best" in text
-    assert sorted(path.name for path in out.iterdir()) == ["best_grasp.png", "grasps.safetensors", "plan.json"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "best_grasp.png",
+        "grasps.safetensors",
+        "plan.json",
+        "refined.png",
+    ]
     plan = json.loads((out / "plan.json").read_text())
     grasps = Grasps.load(out / "grasps.safetensors")
     assert grasps.frame == plan["frame"] == "camera"
@@ -185,10 +191,10 @@ def test_collect_makes_a_set_and_goes_on(run: Run, tmp_path: Path, monkeypatch: 
 def test_models_are_listed(run: Run) -> None:
     status, out, err = run("models", "--json")
     assert (status, err) == (0, "")
-    assert [row["name"] for row in json.loads(out)["models"]] == cli.list_models()
+    assert [row["name"] for row in json.loads(out)["models"]] == list_models()
     status, out, err = run("models")
     assert (status, err) == (0, "")
-    assert all(name in out for name in cli.list_models())
+    assert all(name in out for name in list_models())
 
 
 # help
@@ -242,8 +248,8 @@ def refused(result: tuple[int, str, str], message: str) -> None:
         (["plan", "--depth", "d", "--camera", "c", "--seed", "-1"], "--seed: Not of type NonNegativeInt"),
         (["refine", "--depth", "d", "--camera", "c"], "required: --grasps"),
         (
-            ["refine", "--depth", "d", "--camera", "c", "--grasps", "g", "--variables", "wrist"],
-            "--variables: invalid choice: 'wrist'",
+            ["refine", "--depth", "d", "--camera", "c", "--grasps", "g", "--optimiser", "sgd"],
+            "--optimiser: invalid choice: 'sgd'",
         ),
         (["verify"], "required: --object"),
         (["verify", "--object", "can_02", "--trials", "two"], "--trials: Not of type PositiveInt"),
@@ -412,7 +418,7 @@ def test_out_must_be_of_the_right_kind(
     run: Run, observed: list[object], some_grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is looked at before the work is done."""
-    monkeypatch.setattr(cli, "plan", lambda *_: pytest.fail("the work was done"))
+    monkeypatch.setattr(commands, "plan", lambda *_: pytest.fail("the work was done"))
     (tmp_path / "file").write_text("kept")
     refused(run("plan", *observed, "--out", tmp_path / "file"), "file is a file; give a folder")
     refused(run("collect", "--out", tmp_path / "file"), "file is a file; give a folder")
@@ -427,14 +433,14 @@ def test_failures_of_the_machine_are_status_1(
     def full(*_: object) -> None:
         raise OSError("no space left\non the device")
 
-    monkeypatch.setattr(cli, "plan", full)
+    monkeypatch.setattr(commands, "plan", full)
     status, out, err = run("plan", *observed)
     assert (status, out, err) == (1, "", "dexzoo: no space left on the device\n")
 
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "plan", stopped)
+    monkeypatch.setattr(commands, "plan", stopped)
     assert run("plan", *observed) == (1, "", "dexzoo: stopped\n")
 
 
