@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jsonargparse import Namespace
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress, track
 from rich.table import Table
 
 from dexzoo import plots

@@ -102,12 +102,8 @@ def test_plan_writes_a_folder(run: Run, frame: Path, weights: Path, tmp_path: Pa
     status, text, err = run("plan", *observation, "--num_grasps", 8, "--refine", "--out", out)
     assert (status, err) == (0, "")
     assert "the ten best" in text
-    assert sorted(path.name for path in out.iterdir()) == [
-        "best_grasp.png",
-        "grasps.safetensors",
-        "plan.json",
-        "refined.png",
-    ]
+    written = ["best_grasp.png", "grasps.safetensors", "plan.json", "refined.png"]
+    assert sorted(path.name for path in out.iterdir()) == written
     plan = json.loads((out / "plan.json").read_text())
     grasps = Grasps.load(out / "grasps.safetensors")
     assert grasps.frame == plan["frame"] == "camera"
@@ -143,8 +139,24 @@ def test_refine_improves_a_file_of_grasps(run: Run, observed: list[object], some
     result = json.loads(out)
     assert result["num_grasps"] == 6
     assert 0 <= result["accepted"] <= 6
+    assert result["failed"] == 0
     assert 0 < result["mean_score_before"] < 1
     assert len(Grasps.load(tmp_path / "new" / "better")) == 6
+
+
+def test_refine_asks_a_judge_and_draws_what_it_did(
+    run: Run, observed: list[object], some_grasps: Path, tmp_path: Path
+) -> None:
+    args = ["--grasps", some_grasps / "world.safetensors", "--optimiser", "random", "--num_steps", 4, "--seed", 3]
+    picture = tmp_path / "new" / "before and after.png"
+    judge = ["--judge", observed[-1], "--margin", 100]
+    status, out, err = run("refine", *observed, *args, *judge, "--picture", picture, "--json")
+    assert (status, err) == (0, "")
+    assert json.loads(out)["accepted"] == 0  # no rise is that great
+    assert cv2.imread(str(picture)).shape[1] > 2 * 460
+    first, again = (run("refine", *observed, *args, "--json") for _ in range(2))
+    assert first == again
+    assert json.loads(first[1])["accepted"] > 0
 
 
 def test_verify_generates_and_tries(run: Run, weights: Path) -> None:
@@ -423,7 +435,10 @@ def test_out_must_be_of_the_right_kind(
     refused(run("plan", *observed, "--out", tmp_path / "file"), "file is a file; give a folder")
     refused(run("collect", "--out", tmp_path / "file"), "file is a file; give a folder")
     args = ["--grasps", some_grasps / "camera.safetensors", "--out", tmp_path]
-    refused(run("refine", *observed, *args), "is a folder; give a file")
+    refused(run("refine", *observed, *args), f"--out {tmp_path} is a folder; give a file")
+    refused(
+        run("refine", *observed, *args[:2], "--picture", tmp_path), f"--picture {tmp_path} is a folder; give a file"
+    )
     assert (tmp_path / "file").read_text() == "kept"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from dexzoo.refinement.objective import Objective, Terms
 from dexzoo.refinement.optimisers import BY_GRADIENT, OPTIMISERS, Draws, Search
-from dexzoo.refinement.variables import VARIABLES, Region, make_variables
+from dexzoo.refinement.variables import VARIABLES, Region, Variables, make_variables
 
 CHUNK = 50
 """Grasps in work at once; bounds memory, and keeps what lies between layers in cache."""
@@ -92,13 +93,8 @@ def _climb_chunk(
     on_step: OnStep | None,
 ) -> Climb:
     moved = make_variables(settings.variables, given, objective.hand, settings.region)
-    terms_of = objective.near(given)
     states: list[Tensor] = []
     values: list[Tensor] = []
-
-    def evaluate(state: Tensor) -> tuple[Tensor, Terms]:
-        terms = terms_of(moved(state))
-        return objective.value(terms), terms
 
     def told(state: Tensor, value: Tensor) -> None:
         if on_step is not None:
@@ -107,16 +103,30 @@ def _climb_chunk(
         if keep_trace:
             states.append(moved(state))
 
-    search = Search(evaluate, moved.start, settings.optimiser in BY_GRADIENT, told)
-    first = settings.num_steps // 2
-    for moves, num_steps in zip(moved.stages, (first, settings.num_steps - first), strict=True):
+    with torch.no_grad():
+        before = objective.near(given)(given)
+    told(moved.start, objective.value(before))
+    best, failed, after = moved.start, torch.zeros(len(given), dtype=torch.bool), before
+    half = settings.num_steps // 2
+    for moves, num_steps in zip(moved.stages, (half, settings.num_steps - half), strict=True):
+        if not num_steps:
+            continue
+        # what is near is sought anew for each stage
+        evaluate = partial(_evaluate, objective, objective.near(moved(best)), moved)
+        search = Search(evaluate, best, settings.optimiser in BY_GRADIENT, told)
         draws = Draws.draw(CHUNK, num_steps, len(moves), generator).first(len(given))
         OPTIMISERS[settings.optimiser](search, moves, num_steps, settings.step_size, draws)
-    with torch.no_grad():
-        before, best = terms_of(given), moved(search.best)
-    rise = search.value - objective.value(before)
+        best, failed, after = search.best, failed | search.failed, search.terms
+    rise = objective.value(after) - objective.value(before)
     trace = Trace(torch.stack(states), torch.stack(values)) if keep_trace else None
-    return Climb(best, before, search.terms, rise, search.failed, trace)
+    return Climb(moved(best), before, after, rise, failed, trace)
+
+
+def _evaluate(
+    objective: Objective, terms_near: Callable[[Tensor], Terms], moved: Variables, state: Tensor
+) -> tuple[Tensor, Terms]:
+    terms = terms_near(moved(state))
+    return objective.value(terms), terms
 
 
 def _join(parts: list[Climb]) -> Climb:

@@ -79,8 +79,8 @@ def refine(
     an Observation. evaluator: what guides: a model, or what `dexzoo.load` takes.
     judge: another such, which does not guide, but must find the log-odds of a refined grasp higher by more than
     `margin` for it to be accepted. Without one, it is enough that the objective rises.
-    optimiser, num_steps, step_size: `num_steps` evaluations besides that of the given grasps; a step moves a number by
-    about `step_size` of its half of the trust region. The first half of the steps moves the wrist, the second the
+    optimiser, num_steps, step_size: how many states are evaluated besides the first of each half; a step moves a number
+    by about `step_size` of its half of the trust region. The first half of the steps moves the wrist, the second the
     fingers.
     variables: what is moved, see `dexzoo.refinement.variables`. region: how far. weights: what counts how much.
     density: `KopickiGenerator.density` of the view, where it is at hand; it is made if the prior has a weight.

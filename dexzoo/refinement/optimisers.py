@@ -45,9 +45,9 @@ class Draws(NamedTuple):
 class Search:
     """Evaluates states and keeps the best of each grasp, with its gradient.
 
-    evaluate: states to objective and terms. with_gradient: whether gradients are taken. told: called with each state
-    that is evaluated, and its objective. A grasp whose objective or gradient is not finite keeps its last good state,
-    is marked in `failed`, and gets a gradient of zero.
+    evaluate: states to objective and terms. with_gradient: whether gradients are taken. told: called with each further
+    state that is evaluated, and its objective. A grasp whose objective or gradient is not finite keeps its last good
+    state, is marked in `failed`, and gets a gradient of zero.
     """
 
     def __init__(
@@ -62,10 +62,15 @@ class Search:
         self.value = start.new_full((len(start),), -torch.inf)
         self.failed = torch.zeros(len(start), dtype=torch.bool)
         self.terms: Terms = {}
-        self(start)
+        self._look(start)
 
     def __call__(self, state: State) -> tuple[Float[Tensor, " grasp"], State]:
         """Objective, -inf where there is none, and gradient of states."""
+        value, gradient = self._look(state)
+        self.told(state.detach(), value)
+        return value, gradient
+
+    def _look(self, state: State) -> tuple[Float[Tensor, " grasp"], State]:
         state = state.detach()
         if self.with_gradient:
             state = state.requires_grad_()
@@ -89,7 +94,6 @@ class Search:
             name: torch.where(better, term.detach(), self.terms[name]) if self.terms else term.detach()
             for name, term in terms.items()
         }
-        self.told(state, value)
         return value, gradient
 
 

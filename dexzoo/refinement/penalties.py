@@ -22,11 +22,11 @@ MOMENTS = [PREGRASP, GRIP // 2, GRIP]
 """The waypoints at which the hand is looked at; beyond the grip it is meant to press."""
 AT_OBJECT = 1
 """The first of these at which it can be in the object."""
-NUM_OBSERVED, NUM_SHADOW = 512, 256
+NUM_OBSERVED, NUM_SHADOW = 256, 128
 SHADOW_DEPTHS = (0.007, 0.014)
 """Metres behind the observed surface, along the line of sight, at which the object is taken to go on."""
-NUM_NEAR = 48
-"""Points of a kind that are looked at around each grasp; deeper ones do not come into play."""
+NUM_NEAR = 64
+"""Points of a kind that are looked at around each hand; with more it takes longer and tells little else."""
 
 
 class Surroundings:

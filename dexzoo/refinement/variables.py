@@ -7,7 +7,6 @@ region, within the limits of the joints and a path of ten waypoints, whatever an
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -40,20 +39,6 @@ class Region:
         for name, value in asdict(self).items():
             if not 0 < value < torch.inf:
                 raise ValueError(f"the trust region's {name} is {value}, expected a positive number")
-
-
-class Variables(Protocol):
-    """States (grasp, number) within -1...1 to waypoints.
-
-    start: the state of the given grasps. stages: (stage, number) which numbers are moved first, and which then.
-    """
-
-    start: Float[Tensor, "grasp number"]
-    stages: Float[Tensor, "stage number"]
-
-    def __call__(self, state: Float[Tensor, "grasp number"]) -> Float[Tensor, "grasp 10 28"]:
-        """The waypoints; differentiable."""
-        ...
 
 
 class GripVariables:
@@ -129,6 +114,9 @@ class WaypointVariables:
         return torch.cat((way[..., POSITION], quaternion, way[..., JOINTS], self.given[..., TYPE:]), -1)
 
 
+Variables = GripVariables | WaypointVariables
+"""States (grasp, number) within -1...1 to waypoints: start, (grasp, number), is the state of the given grasps; stages,
+(stage, number), says which numbers are moved first and which then."""
 VARIABLES = ("grip", "uncoupled", "waypoints")
 
 
