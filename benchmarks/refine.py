@@ -125,6 +125,7 @@ def main() -> None:
         "judge": Path(options.judge).name if options.judge else None,
         "split": source,
         "num_grasps": options.num_grasps,
+        "without_grasp": sum(not len(row) for row in given.values()),
         "threads": torch.get_num_threads(),
         "variants": compared(given, done),
     }
