@@ -31,10 +31,10 @@ def whole(found: dict[str, Any]) -> str:
     rules = first["top1"]
     return "\n".join(
         [
-            f"`benchmarks/refine.py`; {first['scenes']} scenes of {first['objects']} objects ({found['split']}), at most "
-            f"{found['num_grasps']} grasps of the Kopicki generator each, {first['grasps']:,} in all; in "
-            f"{found['without_grasp']} more scenes it found none. Guided by `{found['evaluator']}`, {judge}. The same trials "
-            "before and after; the simulator selects nothing.\n",
+            f"`benchmarks/refine.py`; {first['scenes']} scenes of {first['objects']} objects ({found['split']}), at "
+            f"most {found['num_grasps']} grasps of the Kopicki generator each, {first['grasps']:,} in all; in "
+            f"{found['without_grasp']} more scenes it found none. Guided by `{found['evaluator']}`, {judge}. The same "
+            "trials before and after; the simulator selects nothing.\n",
             outcomes(variants),
             "Where the grasps went (thesis, Tables 4.2 and 4.3):\n",
             table(("variant", *went), [(other, *row["transitions"].values()) for other, row in variants.items()]),
