@@ -69,7 +69,7 @@ def variants(options: argparse.Namespace) -> dict[str, Variant]:
     if judge is not None:
         known["no acceptance"] = by_refine(model, None)
     for other in options.others:
-        known[f"guided by {Path(other).name}"] = by_refine(dexzoo.load(other), judge)
+        known[f"guided by {other}"] = by_refine(dexzoo.load(other), judge)
     if options.tries:
         for name, arguments in json.loads(options.tries.read_text()).items():
             for key, kind in (("region", Region), ("weights", Weights)):
@@ -105,7 +105,7 @@ def main() -> None:
     source = "meshes" if options.meshes else options.split
     folder = options.folder / f"{source}_{options.num_grasps}"
     # what was refined depends on who guided and who judged
-    refined = folder / "_".join(Path(name).name for name in (options.evaluator, options.judge or "nobody"))
+    refined = folder / "_".join(name.replace("/", "-") for name in (options.evaluator, options.judge or "nobody"))
     if not options.done:
         chosen = {name: known[name] for name in names}
         run(
@@ -121,8 +121,8 @@ def main() -> None:
     if not any(done.values()):
         parser.error(f"folder {refined} holds nothing of {', '.join(names)}; run without --done first")
     result = {
-        "evaluator": Path(options.evaluator).name,
-        "judge": Path(options.judge).name if options.judge else None,
+        "evaluator": options.evaluator,
+        "judge": options.judge,
         "split": source,
         "num_grasps": options.num_grasps,
         "without_grasp": sum(not len(row) for row in given.values()),

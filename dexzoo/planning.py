@@ -14,6 +14,7 @@ from dexzoo.grasp import Grasps
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
 from dexzoo.refinement import rank, refine
+from dexzoo.refinement.ranking import check
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ def plan(
     """
     model = load(evaluator) if isinstance(evaluator, str) else evaluator
     second = load(judge) if isinstance(judge, str) else judge
+    check(ranking, second is not None)
     generated = generate(observation, num_grasps, seed, generator)
     score = model.score(observation, generated)
     order = score.argsort(descending=True, stable=True)

@@ -333,7 +333,7 @@ def test_progress_is_told_and_the_whole_way_kept(can_view: Observation, grasps: 
     best = result.trace.objective.argmax(0)
     way = result.trace.waypoints[best, torch.arange(12)]
     torch.testing.assert_close(way, result.grasps.waypoints, atol=1e-5, rtol=0)
-    still = result.trace.waypoints[:4, :, GRIP, 7:27]
+    still = result.trace.waypoints[:5, :, GRIP, 7:27]
     torch.testing.assert_close(still, still[:1].expand_as(still))  # the wrist goes first
     assert (result.trace.waypoints[-1, :, GRIP, 7:27] == still[0]).all()  # here the fingers have nothing to gain
 
@@ -468,3 +468,6 @@ def test_an_evaluator_without_gradients_serves_those_who_need_none(grasps: Grasp
     with pytest.raises(ValueError, match="evaluator known has no gradient in the grasps; use the optimiser metropolis"):
         refine(grasps, can_view, blind, weights=NOTHING)
     assert refine(grasps, can_view, blind, weights=NOTHING, optimiser="random").accepted.any()
+    weight = torch.ones((), requires_grad=True)  # its own weights have a slope, the grasps have none
+    with pytest.raises(ValueError, match="evaluator known has no gradient in the grasps"):
+        refine(grasps, can_view, Known(lambda w: weight * nearness(w.detach())), weights=NOTHING)

@@ -107,8 +107,8 @@ def _climb_chunk(
         before = objective.near(given)(given)
     told(moved.start, objective.value(before))
     best, failed, after = moved.start, torch.zeros(len(given), dtype=torch.bool), before
-    half = settings.num_steps // 2
-    for moves, num_steps in zip(moved.stages, (half, settings.num_steps - half), strict=True):
+    later = settings.num_steps // 2
+    for moves, num_steps in zip(moved.stages, (settings.num_steps - later, later), strict=True):
         if not num_steps:
             continue
         # what is near is sought anew for each stage

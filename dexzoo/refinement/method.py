@@ -177,9 +177,11 @@ def _generator() -> KopickiGenerator:
 
 
 def _check_gradient(view: PreparedView, waypoints: Tensor) -> None:
+    free = waypoints.clone().requires_grad_()
     with torch.enable_grad():
-        logit = view.logit(waypoints.clone().requires_grad_())
-    if not logit.requires_grad:
+        logit = view.logit(free)
+    known = logit.requires_grad and torch.autograd.grad(logit.sum(), free, allow_unused=True)[0] is not None
+    if not known:
         raise ValueError(
             f"evaluator {view.evaluator.architecture} has no gradient in the grasps; use the optimiser metropolis or "
             "random, or another evaluator"

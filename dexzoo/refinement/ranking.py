@@ -32,8 +32,8 @@ def lesser(result: Refinement) -> Float[Tensor, " grasp"]:
 
 def judge(result: Refinement) -> Float[Tensor, " grasp"]:
     """The judge's score of the returned grasp. ValueError where there was no judge."""
-    if result.judge_after is None:
-        raise ValueError('ranking by "judge" needs a refinement with a judge')
+    check("judge", result.judge_after is not None)
+    assert result.judge_after is not None
     return result.judge_after
 
 
@@ -52,8 +52,15 @@ RANKINGS: dict[str, Callable[[Refinement], Tensor]] = {
 }
 
 
-def rank(result: Refinement, by: str = "before") -> Tensor:
-    """Indices of the returned grasps, the best first; ties stay in order. ValueError for a rule that is not known."""
+def check(by: str, judged: bool) -> None:
+    """ValueError for a rule that is not known, or needs a judge where there is none."""
     if by not in RANKINGS:
         raise ValueError(f"ranking {by!r} is unknown, use one of {', '.join(RANKINGS)}")
+    if by == "judge" and not judged:
+        raise ValueError('ranking by "judge" needs a refinement with a judge')
+
+
+def rank(result: Refinement, by: str = "before") -> Tensor:
+    """Indices of the returned grasps, the best first; ties stay in order. ValueError for a rule that is not known."""
+    check(by, result.judge_after is not None)
     return RANKINGS[by](result).argsort(descending=True, stable=True)
