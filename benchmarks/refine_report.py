@@ -13,13 +13,13 @@ RULES = {
     "judge": "judge",
     "mean": "mean of evaluator and judge",
 }
-PARTS = {"refinement": "", "refinement_meshes": "### On objects from elsewhere\n\n"}
+MESHES = "### On objects from elsewhere\n\n"
 
 
 def refinement() -> str:
     """What has been measured of refinement; each part as soon as its benchmark has been run."""
-    there = {name: title for name, title in PARTS.items() if (RESULTS / f"{name}.json").exists()}
-    return "\n".join(title + whole(read(name)) for name, title in there.items())
+    parts = {"refinement": whole, "refinement_meshes": lambda found: MESHES + whole(found), "refinement_cost": cost}
+    return "\n".join(write(read(name)) for name, write in parts.items() if (RESULTS / f"{name}.json").exists())
 
 
 def whole(found: dict[str, Any]) -> str:
@@ -89,3 +89,23 @@ def outcomes(variants: dict[str, Any]) -> str:
         for name, row in variants.items()
     ]
     return table(head, rows)
+
+
+def cost(found: dict[str, Any]) -> str:
+    whole, alone, density = (found[name] for name in ("whole", "evaluator_alone", "density"))
+    terms = found["processor_seconds_of_terms"]
+    keys = {"seconds": 1, "processor_seconds": 1, "peak_megabytes": 0}
+    rows = [(f"{row['grasps']:,}", *(f"{row[key]:.{n}f}" for key, n in keys.items())) for row in found["growth"]]
+    return "\n".join(
+        [
+            f"### Cost\n\n`benchmarks/refine_cost.py`; guided by `{found['evaluator']}`, {found['threads']} threads. "
+            f"100 grasps x {found['num_steps']} steps take {whole['seconds']:.1f} s and at most "
+            f"{whole['peak_megabytes']:.0f} MB with all that is loaded; the evaluator alone takes "
+            f"{alone['seconds']:.1f} s. The density behind the prior is made once for a view, in "
+            f"{density['seconds']:.1f} s. Processor seconds that each term adds to the evaluator's "
+            f"{alone['processor_seconds']:.1f}:\n",
+            table(tuple(name.replace("_", " ") for name in terms), [tuple(f"{value:.2f}" for value in terms.values())]),
+            f"In {found['few_steps']} steps:\n",
+            table(("grasps", "seconds", "processor seconds", "MB at most"), rows),
+        ]
+    )
