@@ -165,7 +165,9 @@ def test_the_shadow_is_behind_what_is_seen(can_view: Observation, around: Surrou
     camera = can_view.T_world_camera[:3, 3]
     gap = np.linalg.norm(shadow[:, None] - around.observed.numpy(), axis=-1).min(1)
     assert gap.max() < max(SHADOW_DEPTHS) + 0.006  # one point in several is in the sample
-    farther = np.linalg.norm(shadow - camera, axis=1).mean() - np.linalg.norm(around.observed - camera, axis=1).mean()
+    farther = (
+        np.linalg.norm(shadow - camera, axis=1).mean() - np.linalg.norm(around.observed.numpy() - camera, axis=1).mean()
+    )
     assert farther == pytest.approx(np.mean(SHADOW_DEPTHS), abs=0.003)
 
 

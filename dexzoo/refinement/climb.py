@@ -103,21 +103,24 @@ def _climb_chunk(
         if keep_trace:
             states.append(moved(state))
 
+    terms_near = objective.near(given)
     with torch.no_grad():
-        before = objective.near(given)(given)
-    told(moved.start, objective.value(before))
+        before = terms_near(given)
+    value = objective.value(before)
+    told(moved.start, torch.where(torch.isfinite(value), value, -torch.inf))
     best, failed, after = moved.start, torch.zeros(len(given), dtype=torch.bool), before
     later = settings.num_steps // 2
     for moves, num_steps in zip(moved.stages, (settings.num_steps - later, later), strict=True):
         if not num_steps:
             continue
-        # what is near is sought anew for each stage
-        evaluate = partial(_evaluate, objective, objective.near(moved(best)), moved)
+        if best is not moved.start:  # what is near may no longer be
+            terms_near = objective.near(moved(best))
+        evaluate = partial(_evaluate, objective, terms_near, moved)
         search = Search(evaluate, best, settings.optimiser in BY_GRADIENT, told)
         draws = Draws.draw(CHUNK, num_steps, len(moves), generator).first(len(given))
         OPTIMISERS[settings.optimiser](search, moves, num_steps, settings.step_size, draws)
         best, failed, after = search.best, failed | search.failed, search.terms
-    rise = objective.value(after) - objective.value(before)
+    rise = objective.value(after) - value
     trace = Trace(torch.stack(states), torch.stack(values)) if keep_trace else None
     return Climb(moved(best), before, after, rise, failed, trace)
 
