@@ -1,63 +1,133 @@
-"""What refinement does to the verified success: the same trials before and after, on test objects.
+"""What refinement does to the verified success: the same trials before and after, of the Kopicki generator's grasps.
 
-python benchmarks/refine.py --out benchmarks/results/refine.json
-Each group of variables is refined and executed apart; transitions are counted grasp by grasp.
+python benchmarks/refine.py --evaluator RUN --judge OTHER_RUN --out benchmarks/results/refinement.json
+The objects of a split come round in turn, each scene with its own drawn mass and friction, in which a grasp is tried as
+given and as refined. `--folder` keeps what was done in each scene, so that a run can be continued: take a new one when
+the program has changed. Hyper-parameters are chosen with `--split validation --tries FILE`: JSON of names, and for each
+the arguments of `dexzoo.refine` that differ. Intervals are 95 % bootstrap over scenes; OMP_NUM_THREADS bounds the
+threads. The simulator selects nothing.
 """
 
 import argparse
 import json
 import sys
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+from generator import Setting, set_scene
+from refine_figures import FLAGS, Given, Refined, compared
 
 import dexzoo
-from dexzoo.sim.shapes import make_object, object_names, split_of
+from dexzoo import Grasps, Observation
+from dexzoo.generators.density import GraspDensity
+from dexzoo.generators.kopicki import KopickiGenerator
+from dexzoo.grasp import GRIP
+from dexzoo.hand import default_hand
+from dexzoo.models.evaluator import GraspEvaluator
+from dexzoo.refinement import Refinement, Region, Weights, thesis
+from dexzoo.sim import Scene, trial
 
-GROUPS = {
-    "A: 2 steps, all waypoints": ("waypoints", 2),
-    "B: 2 steps, last three": ("last3", 2),
-    "C: 20 steps, last three": ("last3", 20),
-    "grip: 20 steps, wrist and 15 joints": ("grip", 20),
-}
+METHOD = "method"
+SPLITS = ("test", "validation")
+NUM_POINTS = 2000
+"""Observed points by which penetration is measured."""
+Variant = Callable[[Grasps, Observation, GraspDensity], Refinement]
+
+
+def by_refine(evaluator: GraspEvaluator, judge: GraspEvaluator | None, **arguments: Any) -> Variant:  # noqa: ANN401
+    def run(grasps: Grasps, view: Observation, density: GraspDensity) -> Refinement:
+        return dexzoo.refine(grasps, view, evaluator, judge=judge, density=density, **arguments)
+
+    return run
+
+
+def by_thesis(evaluator: GraspEvaluator, group: str) -> Variant:
+    return lambda grasps, view, _: thesis.ascend(grasps, view, evaluator, group=group)
+
+
+def variants(options: argparse.Namespace) -> dict[str, Variant]:
+    """All that can be run, by name, the method first."""
+    model = dexzoo.load(options.evaluator)
+    judge = dexzoo.load(options.judge) if options.judge else None
+    method = partial(by_refine, model, judge)
+    known = {
+        METHOD: method(),
+        **{f"group {name}": by_thesis(model, name) for name in thesis.GROUPS},
+        "L-BFGS": method(optimiser="lbfgs"),
+        "Metropolis-Hastings": method(optimiser="metropolis"),
+        "random search": method(optimiser="random"),
+        "no prior": method(weights=Weights(prior=0.0)),
+        "no penetration": method(weights=Weights(penetration=0.0, shadow=0.0)),
+        "no coupling": method(variables="uncoupled"),
+        "280 free numbers": method(variables="waypoints"),
+    }
+    if judge is not None:
+        known["no acceptance"] = by_refine(model, None)
+    for other in options.others:
+        known[f"guided by {other}"] = by_refine(dexzoo.load(other), judge)
+    if options.tries:
+        for name, arguments in json.loads(options.tries.read_text()).items():
+            for key, kind in (("region", Region), ("weights", Weights)):
+                if key in arguments:
+                    arguments[key] = kind(**arguments[key])
+            known[name] = method(**arguments)
+    return known
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--evaluator", default="em2")
-    parser.add_argument("--scenes", type=int, default=24)
-    parser.add_argument("--num_grasps", type=int, default=30)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--evaluator", default="em2", help="what guides: name, file or folder")
+    parser.add_argument("--judge", help="what accepts, the same")
+    parser.add_argument("--others", nargs="*", default=[], help="evaluators that guide in its place, each a variant")
+    parser.add_argument("--tries", type=Path, help="JSON of further variants")
+    parser.add_argument("--variants", nargs="+", metavar="NAME", help="default: all")
+    parser.add_argument("--split", default="test", choices=SPLITS)
+    parser.add_argument(
+        "--meshes", type=Path, help="folder of objects, as benchmarks/meshes.py takes it, for the split"
+    )
+    parser.add_argument("--scenes", type=int, default=150)
+    parser.add_argument("--num_grasps", type=int, default=40)
+    parser.add_argument("--done", action="store_true", help="try nothing more, sum up what the folder holds")
+    parser.add_argument("--folder", type=Path, default=Path("out/refine"))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    model = dexzoo.load(options.evaluator)
-    objects = [name for name in object_names() if split_of(name) == "test"]
-    before: list[np.ndarray] = []
-    after: dict[str, list[np.ndarray]] = {name: [] for name in GROUPS}
-    collided: dict[str, int] = dict.fromkeys(GROUPS, 0)
-    rise: dict[str, list[float]] = {name: [] for name in GROUPS}
-    for index in range(options.scenes):
-        scene = dexzoo.sim.Scene.place(make_object(objects[index % len(objects)]), seed=1000 + index)
-        observation = scene.observe(seed=index)
-        try:
-            grasps = dexzoo.generate(observation, options.num_grasps, seed=index)
-        except RuntimeError:
-            continue
-        before.append(dexzoo.verify(grasps, scene).success)
-        for name, (variables, steps) in GROUPS.items():
-            rate = 0.2 if variables == "grip" else 0.01
-            result = dexzoo.refine(grasps, observation, model, variables=variables, num_steps=steps, learning_rate=rate)
-            outcomes = dexzoo.verify(result.grasps, scene)
-            after[name].append(outcomes.success)
-            collided[name] += int(outcomes.collided.sum())
-            rise[name] += (result.score_after - result.score_before).tolist()
-        sys.stderr.write(f"{index + 1} of {options.scenes} scenes\n")
-    was = np.concatenate(before)
+    known = variants(options)
+    names = options.variants or list(known)
+    if unknown := set(names) - set(known):
+        parser.error(f"variants {', '.join(sorted(unknown))} are unknown; use some of {', '.join(known)}")
+    if options.meshes and not any(options.meshes.glob("*/mesh.obj")):
+        parser.error(f"folder {options.meshes} holds no NAME/mesh.obj; give a folder of objects' folders")
+    source = "meshes" if options.meshes else options.split
+    folder = options.folder / f"{source}_{options.num_grasps}"
+    # what was refined depends on who guided and who judged
+    refined = folder / "_".join(name.replace("/", "-") for name in (options.evaluator, options.judge or "nobody"))
+    if not options.done:
+        chosen = {name: known[name] for name in names}
+        run(
+            chosen,
+            partial(set_scene, options.split, options.meshes),
+            folder,
+            refined,
+            options.scenes,
+            options.num_grasps,
+        )
+    given = Given.load_all(folder / "given", options.scenes)
+    done = {name: Refined.load_all(refined / name, options.scenes) for name in names}
+    if not any(done.values()):
+        parser.error(f"folder {refined} holds nothing of {', '.join(names)}; run without --done first")
     result = {
         "evaluator": options.evaluator,
-        "scenes": len(before),
-        "grasps": len(was),
-        "success_before": float(was.mean()),
-        "groups": {name: row(before, after[name], collided[name], float(np.mean(rise[name]))) for name in GROUPS},
+        "judge": options.judge,
+        "split": source,
+        "num_grasps": options.num_grasps,
+        "without_grasp": sum(not len(row) for row in given.values()),
+        "threads": torch.get_num_threads(),
+        "variants": compared(given, done),
     }
     text = json.dumps(result, indent=2)
     if options.out:
@@ -65,23 +135,90 @@ def main() -> None:
     sys.stdout.write(text + "\n")
 
 
-def row(before: list[np.ndarray], after: list[np.ndarray], collided: int, rise: float) -> dict[str, object]:
-    was, now = np.concatenate(before), np.concatenate(after)
-    rng = np.random.default_rng(0)
-    draws = [rng.integers(len(before), size=len(before)) for _ in range(1000)]
-    change = [
-        np.concatenate([after[i] for i in draw]).mean() - np.concatenate([before[i] for i in draw]).mean()
-        for draw in draws
-    ]
-    return {
-        "success_after": float(now.mean()),
-        "change": float(now.mean() - was.mean()),
-        "change_interval": [float(x) for x in np.percentile(change, [2.5, 97.5])],
-        "success_to_fail": int((was & ~now).sum()),
-        "fail_to_success": int((~was & now).sum()),
-        "collided": collided,
-        "mean_rise_of_score": rise,
-    }
+def run(
+    chosen: dict[str, Variant], setting: Setting, folder: Path, refined: Path, scenes: int, num_grasps: int
+) -> None:
+    """Try what is not yet there, all variants on a scene before the next scene."""
+    generator = KopickiGenerator()
+    for number in range(scenes):
+        paths = {name: refined / name / f"{number:03d}.npz" for name in chosen}
+        missing = {name: path for name, path in paths.items() if not path.exists()}
+        if not missing:
+            continue
+        try:
+            scene, view, seed, _ = setting(number)
+        except ValueError as error:
+            sys.stderr.write(f"{error}\n")
+            continue
+        path = folder / "given" / f"{number:03d}.npz"
+        if not path.exists():
+            give(generator, scene, view, seed, num_grasps).save(path)
+        given = Given.load(path)
+        if not len(given):
+            sys.stderr.write(f"{number} {given.object}: no grasp is found\n")
+            continue
+        density = generator.density(view, seed)
+        grasps = Grasps(torch.tensor(given.waypoints), "world")
+        for name, path in missing.items():
+            row = attempt(chosen[name], grasps, given, scene, view, density)
+            row.save(path)
+            held = f"{given.success.sum()} of {len(given)} held, then {row.success.sum()}"
+            sys.stderr.write(f"{number} {given.object}, {name}: {held}\n")
+
+
+def give(generator: KopickiGenerator, scene: Scene, view: Observation, seed: int, num_grasps: int) -> Given:
+    """The generator's grasps of a view, tried; none where it gives up."""
+    try:
+        grasps = generator.generate(view, num_grasps, seed).to_frame("world", view.T_world_camera)
+    except (RuntimeError, ValueError):  # as the interface says
+        grasps = Grasps(torch.zeros(0, 10, 28), "world")
+    obj = scene.object
+    return Given(
+        obj.name, obj.category or obj.name, grasps.waypoints.numpy(), tried(scene, grasps), depth(view, grasps)
+    )
+
+
+def attempt(
+    variant: Variant, grasps: Grasps, given: Given, scene: Scene, view: Observation, density: GraspDensity
+) -> Refined:
+    """Refine and try; a grasp that was not replaced is not tried again, since its trial is the same to the last bit."""
+    start = np.array([time.perf_counter(), time.process_time()])
+    result = variant(grasps, view, density)
+    cost = np.array([time.perf_counter(), time.process_time()]) - start
+    replaced = result.accepted.numpy()
+    outcome, deepest = given.outcome.copy(), given.penetration.copy()
+    after = result.grasps[np.flatnonzero(replaced)]
+    outcome[replaced], deepest[replaced] = tried(scene, after), depth(view, after)
+    return Refined(
+        replaced,
+        result.failed.numpy(),
+        *(_numbers(score, len(grasps)) for score in (result.score_before, result.score_after)),
+        *(_numbers(score, len(grasps)) for score in (result.judge_before, result.judge_after)),
+        outcome,
+        deepest,
+        cost,
+    )
+
+
+def tried(scene: Scene, grasps: Grasps) -> np.ndarray:
+    """(n, 4) bool, columns FLAGS."""
+    outcomes = trial.run(scene, grasps, default_hand(), torch.get_num_threads())
+    return np.stack([getattr(outcomes, flag) for flag in FLAGS], -1)
+
+
+def depth(view: Observation, grasps: Grasps) -> np.ndarray:
+    """(n,) metres that an observed point lies at most in a link, up to the grip."""
+    hand, points = default_hand(), torch.from_numpy(view.points_world)
+    points = points[torch.linspace(0, len(points) - 1, min(NUM_POINTS, len(points))).long()]
+    deepest: list[float] = []
+    for row in range(len(grasps)):
+        links = grasps.wrist_pose[row, : GRIP + 1, None] @ hand.forward_kinematics(grasps.joints[row, : GRIP + 1])
+        deepest.append(float(-hand.signed_distance(links, points).amin().clamp_max(0)))
+    return np.array(deepest)
+
+
+def _numbers(values: torch.Tensor | None, count: int) -> np.ndarray:
+    return np.full(count, np.nan) if values is None else values.numpy()
 
 
 if __name__ == "__main__":

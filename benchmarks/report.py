@@ -5,8 +5,9 @@ python benchmarks/report.py
 
 from typing import Any
 
-from generator_report import generator, rate
-from tables import ROOT, percent, read, span, table, with_figures
+from generator_report import generator, points, rate
+from refine_report import refinement
+from tables import RESULTS, ROOT, percent, read, span, table, with_figures
 
 from dexzoo.comparison.report import NOTES, cost_table, counts_table, main_table, title
 from dexzoo.comparison.report import table as markdown_table
@@ -24,10 +25,11 @@ def main() -> None:
     sheet.write_text(with_figures(sheet.read_text(), objects()))
     grasps = ROOT / "docs" / "generator.md"
     grasps.write_text(with_figures(grasps.read_text(), generator()))
+    refined = ROOT / "docs" / "refinement.md"
+    refined.write_text(with_figures(refined.read_text(), refinement()))
 
 
 def summary() -> str:
-    grip = read("refine")["groups"]["grip: 20 steps, wrist and 15 joints"]
     generated = read("comparison")["sources"]["generated"]
     em2, gm = (generated["rows"][name]["figures"] for name in ("em2", "gm"))
     auroc, first, own = em2["auroc"], em2["top1"], gm["top1"]
@@ -45,12 +47,20 @@ def summary() -> str:
             f"{percent(own['value'])} ({span(own['interval'], 100, 1)})",
         ),
         ("first grasp set: success of all generated grasps", percent(generated["success_rate"])),
-        (
-            "first grasp set: change of success by refinement guided by `em2`",
-            f"{100 * grip['change']:+.1f} points ({span(grip['change_interval'], 100, 1)})",
-        ),
+        refined_row(),
     ]
     return table(("what, on test objects", "figure (95 % interval over scenes)"), rows)
+
+
+def refined_row() -> tuple[str, str]:
+    """What refinement does to the success of the generator's grasps."""
+    if (RESULTS / "refinement.json").exists():
+        found = read("refinement")
+        _, method = next(iter(found["variants"].items()))
+        return f"change of success by refinement guided by `{found['evaluator']}`", points(method["change"])
+    grip = read("refine")["groups"]["grip: 20 steps, wrist and 15 joints"]
+    change = f"{100 * grip['change']:+.1f} points ({span(grip['change_interval'], 100, 1)})"
+    return "first grasp set: change of success by refinement guided by `em2`", change
 
 
 def counts() -> str:
@@ -241,13 +251,12 @@ def evaluators(found: dict[str, Any]) -> str:
     return "\n".join(parts)
 
 
-def page() -> str:
-    refine, meshes = read("refine"), read("meshes")
-    kinematics, collect = read("kinematics"), read("collect")
+def first_refinement() -> str:
+    """What refinement did before it was rebuilt, until the benchmark has been run anew."""
+    if (RESULTS / "refinement.json").exists():
+        return "## Refinement\n\nIts own page: [refinement.md](refinement.md).\n"
+    refine = read("refine")
     parts = [
-        "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
-        "bootstrap over scenes.\n",
-        evaluators(read("comparison")),
         f"## Refinement\n\n`benchmarks/refine.py`; guided by `{refine['evaluator']}`, {refine['grasps']} grasps in "
         f"{refine['scenes']} scenes of test objects, of which {percent(refine['success_before'])} hold as generated; "
         "the same trials before and after.\n",
@@ -276,6 +285,18 @@ def page() -> str:
                 for name, row in refine["groups"].items()
             ],
         ),
+    ]
+    return "\n".join(parts)
+
+
+def page() -> str:
+    meshes = read("meshes")
+    kinematics, collect = read("kinematics"), read("collect")
+    parts = [
+        "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
+        "bootstrap over scenes.\n",
+        evaluators(read("comparison")),
+        first_refinement(),
         "## Labels\n\n" + labels(read("simulator")),
         f"## The hand\n\n`benchmarks/kinematics.py`, {kinematics['threads']} threads; all links of "
         f"{kinematics['kinematics']['batch']:,} postures, against pytorch_kinematics "

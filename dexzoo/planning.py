@@ -13,18 +13,21 @@ from dexzoo.generators.generator import GraspGenerator
 from dexzoo.grasp import Grasps
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
-from dexzoo.refinement import refine
+from dexzoo.refinement import rank, refine
+from dexzoo.refinement.ranking import check
 
 
 @dataclass(frozen=True)
 class Plan:
     """Grasps in the camera frame, best first, and what is known of each.
 
-    All (num_grasps,). score: probability of success as generated, which ranks them. refined_score: after refinement;
-    equal to score where none was asked for or accepted. generator_rank: place in the generator's own order, 0 the best.
+    given: the same grasps before refinement. All others (num_grasps,). score: probability of success as generated.
+    refined_score: after refinement; equal to score where none was asked for or accepted. generator_rank: place in the
+    generator's own order, 0 the best.
     """
 
     grasps: Grasps
+    given: Grasps
     score: Tensor
     refined_score: Tensor
     generator_rank: Tensor
@@ -49,21 +52,26 @@ def plan(
     num_refined: int = 0,
     seed: int = 0,
     generator: str | GraspGenerator = "kopicki",
+    judge: str | GraspEvaluator | None = None,
+    ranking: str = "before",
 ) -> Plan:
-    """Generate grasps, rank them by the evaluator and refine the best `num_refined`.
+    """Generate grasps, rank them by the evaluator and refine the best `num_refined`, which stay ahead of the others.
 
-    The order is that of the scores before refinement: ranking by refined scores picks the grasps whose score inflated
-    most (thesis, Table 4.6).
-    Raises what `generate` and `dexzoo.load` raise.
+    judge: a second evaluator, without whose consent no grasp is replaced. ranking: the order of the refined, a name in
+    `dexzoo.refinement.RANKINGS`; "before" leaves that of the scores as generated: ranking by refined scores picks the
+    grasps whose score inflated most (thesis, Table 4.6).
+    Raises what `generate`, `dexzoo.refine` and `dexzoo.load` raise.
     """
     model = load(evaluator) if isinstance(evaluator, str) else evaluator
+    second = load(judge) if isinstance(judge, str) else judge
+    check(ranking, second is not None)
     generated = generate(observation, num_grasps, seed, generator)
     score = model.score(observation, generated)
     order = score.argsort(descending=True, stable=True)
-    grasps, score = generated[order], score[order]
-    refined_score = score
-    if num_refined > 0:
-        result = refine(grasps[:num_refined], observation, model)
-        grasps = Grasps.concatenate([result.grasps, grasps[num_refined:]])
-        refined_score = torch.cat((result.score_after, score[num_refined:]))
-    return Plan(grasps, score, refined_score, order)
+    if num_refined <= 0:
+        return Plan(generated[order], generated[order], score[order], score[order], order)
+    result = refine(generated[order[:num_refined]], observation, model, judge=second)
+    place, rest = rank(result, ranking), order[num_refined:]
+    order = torch.cat((order[:num_refined][place], rest))
+    grasps = Grasps.concatenate([result.grasps[place], generated[rest]])
+    return Plan(grasps, generated[order], score[order], torch.cat((result.score_after[place], score[rest])), order)

@@ -20,6 +20,7 @@ Image = NDArray[np.uint8]
 OBJECT_COLOUR = (214, 150, 60)
 HAND_COLOUR = (70, 120, 200)
 TABLE_COLOUR = (225, 225, 220)
+OUTLINE_COLOUR = (200, 30, 30)
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,23 @@ def grasp_picture(observation: Observation, hand: Hand, grasp: Grasps) -> Image:
     aimed = observation.aimed(460)
     pictures = [overlay_hand(aimed, hand, world, waypoint) for waypoint in moments.values()]
     return grid(pictures, list(moments), columns=3)
+
+
+def refinement_picture(observation: Observation, hand: Hand, before: Grasps, after: Grasps) -> Image:
+    """One grasp before and after refinement at pre-grasp, grip and squeeze; a line shows where the hand was before."""
+    moments = {"pre-grasp": PREGRASP, "grip": GRIP, "squeeze": SQUEEZE}
+    first, then = (grasp.to_frame("world", observation.T_world_camera) for grasp in (before, after))
+    aimed = observation.aimed(460)
+    given = [overlay_hand(aimed, hand, first, waypoint) for waypoint in moments.values()]
+    refined = []
+    for waypoint in moments.values():
+        picture = overlay_hand(aimed, hand, then, waypoint).copy()
+        shape = hand_solid(hand, first.waypoints[0, waypoint])
+        seen = np.isfinite(render([shape], aimed.camera, aimed.T_world_camera, table=False)[1]).astype(np.uint8)
+        outline, _ = cv2.findContours(seen, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        refined.append(np.asarray(cv2.drawContours(picture, outline, -1, OUTLINE_COLOUR, 1), np.uint8))
+    titles = [f"{name}, {when}" for when in ("as given", "refined; line: as given") for name in moments]
+    return grid(given + refined, titles, columns=3)
 
 
 def grid(pictures: Sequence[Image], titles: Sequence[str], columns: int) -> Image:

@@ -23,6 +23,7 @@ LAYERS = [
     {"refinement", "verification"},
     {"data"},
     {"planning", "training", "comparison", "plots", "viewer"},
+    {"commands"},
     {"cli"},
     {"__main__"},
 ]

@@ -14,13 +14,14 @@ import torch
 import trimesh
 from safetensors.torch import save_file
 
-from dexzoo import cli, planning
+from dexzoo import cli, commands, planning
 from dexzoo.camera import Observation
 from dexzoo.comparison import scores
 from dexzoo.data import collect as collecting
 from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import GRASP_TYPES, Grasps
 from dexzoo.models.em2 import EM2
+from dexzoo.models.zoo import list_models
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -101,7 +102,8 @@ def test_plan_writes_a_folder(run: Run, frame: Path, weights: Path, tmp_path: Pa
     status, text, err = run("plan", *observation, "--num_grasps", 8, "--refine", "--out", out)
     assert (status, err) == (0, "")
     assert "the ten best" in text
-    assert sorted(path.name for path in out.iterdir()) == ["best_grasp.png", "grasps.safetensors", "plan.json"]
+    written = ["best_grasp.png", "grasps.safetensors", "plan.json", "refined.png"]
+    assert sorted(path.name for path in out.iterdir()) == written
     plan = json.loads((out / "plan.json").read_text())
     grasps = Grasps.load(out / "grasps.safetensors")
     assert grasps.frame == plan["frame"] == "camera"
@@ -137,8 +139,24 @@ def test_refine_improves_a_file_of_grasps(run: Run, observed: list[object], some
     result = json.loads(out)
     assert result["num_grasps"] == 6
     assert 0 <= result["accepted"] <= 6
+    assert result["failed"] == 0
     assert 0 < result["mean_score_before"] < 1
     assert len(Grasps.load(tmp_path / "new" / "better")) == 6
+
+
+def test_refine_asks_a_judge_and_draws_what_it_did(
+    run: Run, observed: list[object], some_grasps: Path, tmp_path: Path
+) -> None:
+    args = ["--grasps", some_grasps / "world.safetensors", "--optimiser", "random", "--num_steps", 4, "--seed", 3]
+    picture = tmp_path / "new" / "before and after.png"
+    judge = ["--judge", observed[-1], "--margin", 100]
+    status, out, err = run("refine", *observed, *args, *judge, "--picture", picture, "--json")
+    assert (status, err) == (0, "")
+    assert json.loads(out)["accepted"] == 0  # no rise is that great
+    assert cv2.imread(str(picture)).shape[1] > 2 * 460
+    first, again = (run("refine", *observed, *args, "--json") for _ in range(2))
+    assert first == again
+    assert json.loads(first[1])["accepted"] > 0
 
 
 def test_verify_generates_and_tries(run: Run, weights: Path) -> None:
@@ -185,10 +203,10 @@ def test_collect_makes_a_set_and_goes_on(run: Run, tmp_path: Path, monkeypatch: 
 def test_models_are_listed(run: Run) -> None:
     status, out, err = run("models", "--json")
     assert (status, err) == (0, "")
-    assert [row["name"] for row in json.loads(out)["models"]] == cli.list_models()
+    assert [row["name"] for row in json.loads(out)["models"]] == list_models()
     status, out, err = run("models")
     assert (status, err) == (0, "")
-    assert all(name in out for name in cli.list_models())
+    assert all(name in out for name in list_models())
 
 
 # help
@@ -242,8 +260,8 @@ def refused(result: tuple[int, str, str], message: str) -> None:
         (["plan", "--depth", "d", "--camera", "c", "--seed", "-1"], "--seed: Not of type NonNegativeInt"),
         (["refine", "--depth", "d", "--camera", "c"], "required: --grasps"),
         (
-            ["refine", "--depth", "d", "--camera", "c", "--grasps", "g", "--variables", "wrist"],
-            "--variables: invalid choice: 'wrist'",
+            ["refine", "--depth", "d", "--camera", "c", "--grasps", "g", "--optimiser", "sgd"],
+            "--optimiser: invalid choice: 'sgd'",
         ),
         (["verify"], "required: --object"),
         (["verify", "--object", "can_02", "--trials", "two"], "--trials: Not of type PositiveInt"),
@@ -412,12 +430,15 @@ def test_out_must_be_of_the_right_kind(
     run: Run, observed: list[object], some_grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is looked at before the work is done."""
-    monkeypatch.setattr(cli, "plan", lambda *_: pytest.fail("the work was done"))
+    monkeypatch.setattr(commands, "plan", lambda *_: pytest.fail("the work was done"))
     (tmp_path / "file").write_text("kept")
     refused(run("plan", *observed, "--out", tmp_path / "file"), "file is a file; give a folder")
     refused(run("collect", "--out", tmp_path / "file"), "file is a file; give a folder")
     args = ["--grasps", some_grasps / "camera.safetensors", "--out", tmp_path]
-    refused(run("refine", *observed, *args), "is a folder; give a file")
+    refused(run("refine", *observed, *args), f"--out {tmp_path} is a folder; give a file")
+    refused(
+        run("refine", *observed, *args[:2], "--picture", tmp_path), f"--picture {tmp_path} is a folder; give a file"
+    )
     assert (tmp_path / "file").read_text() == "kept"
 
 
@@ -427,14 +448,14 @@ def test_failures_of_the_machine_are_status_1(
     def full(*_: object) -> None:
         raise OSError("no space left\non the device")
 
-    monkeypatch.setattr(cli, "plan", full)
+    monkeypatch.setattr(commands, "plan", full)
     status, out, err = run("plan", *observed)
     assert (status, out, err) == (1, "", "dexzoo: no space left on the device\n")
 
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "plan", stopped)
+    monkeypatch.setattr(commands, "plan", stopped)
     assert run("plan", *observed) == (1, "", "dexzoo: stopped\n")
 
 

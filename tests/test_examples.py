@@ -75,4 +75,6 @@ def test_the_figures_are_those_that_the_benchmarks_wrote(monkeypatch: pytest.Mon
     assert report["with_figures"](views, report["sensor"]()) == views
     grasps = (ROOT / "docs" / "generator.md").read_text()
     assert report["with_figures"](grasps, report["generator"]()) == grasps
+    refined = (ROOT / "docs" / "refinement.md").read_text()
+    assert report["with_figures"](refined, report["refinement"]()) == refined
     assert (ROOT / "docs" / "results.md").read_text() == report["page"]()

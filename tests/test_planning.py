@@ -59,6 +59,37 @@ def test_only_the_best_are_refined_and_the_order_stays(can_view: Observation) ->
     torch.testing.assert_close(plan.refined_score, NearIsGood().score(can_view, plan.grasps), atol=1e-5, rtol=1e-4)
 
 
+def test_a_judge_that_never_agrees_leaves_the_plan_as_it_was(can_view: Observation) -> None:
+    class AllIsOne(NearIsGood):
+        def logit(self, scene: Scene, grasps: Tensor) -> Tensor:
+            return 0 * super().logit(scene, grasps)
+
+    plain = planning.plan(can_view, NearIsGood(), num_grasps=10)
+    plan = planning.plan(can_view, NearIsGood(), num_grasps=10, num_refined=5, judge=AllIsOne())
+    assert torch.equal(plan.grasps.waypoints, plain.grasps.waypoints)
+    assert torch.equal(plan.refined_score, plan.score)
+
+
+def test_the_refined_may_be_ranked_anew_and_stay_ahead(can_view: Observation, generated: Grasps) -> None:
+    plan = planning.plan(can_view, NearIsGood(), num_grasps=20, num_refined=8, ranking="after")
+    assert (plan.refined_score[:8].diff() <= 0).all()
+    assert (plan.refined_score[8:].diff() <= 0).all()
+    assert torch.equal(plan.given.waypoints, generated.waypoints[plan.generator_rank])
+    torch.testing.assert_close(plan.score, NearIsGood().score(can_view, plan.given))
+    torch.testing.assert_close(plan.refined_score, NearIsGood().score(can_view, plan.grasps), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("ranking", "message"), [("best", "ranking 'best' is unknown"), ("judge", "needs a refinement")]
+)
+def test_a_ranking_that_cannot_be_is_told_before_any_work(
+    can_view: Observation, monkeypatch: pytest.MonkeyPatch, ranking: str, message: str
+) -> None:
+    monkeypatch.setattr(planning, "generate", lambda *_: pytest.fail("the generator has run"))
+    with pytest.raises(ValueError, match=message):
+        planning.plan(can_view, NearIsGood(), num_refined=5, ranking=ranking)
+
+
 def test_more_may_be_refined_than_there_are(can_view: Observation) -> None:
     assert len(planning.plan(can_view, NearIsGood(), num_grasps=3, num_refined=20).grasps) == 3
 

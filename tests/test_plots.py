@@ -110,6 +110,23 @@ def test_an_overlay_has_the_size_of_the_image_and_shows_the_hand(
     np.testing.assert_allclose(plots.overlay_hand(can_view, hand, world[0], GRIP), picture, atol=60)
 
 
+def test_before_and_after_differ_where_the_hand_moved(can_view: Observation, can_grasps: Grasps, hand: Hand) -> None:
+    given = can_grasps[0]
+    moved = given.waypoints.clone()
+    moved[..., :3] += 0.01
+    picture = plots.refinement_picture(can_view, hand, given, Grasps(moved, "camera"))
+    still = plots.refinement_picture(can_view, hand, given, given)
+    assert picture.shape == still.shape == (2 * (460 + 28), 3 * 460, 3)
+    half = len(picture) // 2
+    np.testing.assert_array_equal(picture[:half], still[:half])
+    line = (picture == plots.OUTLINE_COLOUR).all(-1)
+    assert not line[:half].any()
+    assert line[half:].sum() == pytest.approx((still == plots.OUTLINE_COLOUR).all(-1).sum())  # where it was given
+    inner = ~line
+    inner[:half] = False
+    assert (picture != still).any(-1)[inner].sum() > 1000
+
+
 def test_the_object_is_tinted(can_view: Observation) -> None:
     picture = plots.depth_picture(can_view).astype(int)
     tint = picture[..., 0] - picture[..., 2]

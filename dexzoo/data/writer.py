@@ -38,15 +38,19 @@ def scene_rows(scene: Mapping[str, Any], views: Sequence[Mapping[str, Any]] = ()
     """
     if scene["split"] not in SPLITS:
         raise ValueError(f"scene {scene['scene']} has the split {scene['split']!r}; use one of {', '.join(SPLITS)}")
-    columns = dict(grasps or {})
-    count = len(next(iter(columns.values()))) if columns else 0
     rows = {
         "scenes": {name: [value] for name, value in scene.items()},
         "views": {name: [view.get(name) for view in views] for name in SCHEMAS["views"].names}
         | {"scene": [scene["scene"]] * len(views), "view": list(range(len(views)))},
-        "grasps": columns | {"scene": [scene["scene"]] * count},
     }
-    return {name: _table(name, values) for name, values in rows.items()}
+    tables = {name: _table(name, values) for name, values in rows.items()}
+    return tables | {"grasps": grasp_rows(scene["scene"], dict(grasps or {}))}
+
+
+def grasp_rows(scene: int, columns: Mapping[str, Any]) -> pa.Table:
+    """Rows of the table of grasps, all of one scene; columns that are left out are null, or there are no rows."""
+    count = len(next(iter(columns.values()))) if columns else 0
+    return _table("grasps", {**columns, "scene": [scene] * count})
 
 
 def _table(name: str, columns: Mapping[str, Any]) -> pa.Table:

@@ -1,0 +1,207 @@
+"""What benchmarks/refine.py keeps of each scene, and the figures that it makes of that."""
+
+import os
+import sys
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from generator_figures import FLAGS, Counts, change_of, mean, rate, resampled
+
+from dexzoo.grasp import Grasps
+from dexzoo.refinement import RANKINGS, Refinement, rank
+
+GENERATOR = "generator"
+"""The rule that takes the generator's own first."""
+
+
+class Kept:
+    """Arrays that go to a file for each scene."""
+
+    def save(self, path: Path) -> None:
+        """Write aside and rename, so that a file is there only when it is whole."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside = path.with_name(f".{os.getpid()}_{path.name}")
+        np.savez(aside, **{field.name: getattr(self, field.name) for field in fields(self)})  # type: ignore[arg-type]
+        aside.rename(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote."""
+        with np.load(path) as stored:
+            return cls(**{name: stored[name] if stored[name].ndim else stored[name].item() for name in stored})
+
+    @classmethod
+    def load_all(cls, folder: Path, scenes: int) -> dict[int, Self]:
+        """What was done in the first so many scenes, by the scene's number."""
+        paths = {number: folder / f"{number:03d}.npz" for number in range(scenes)}
+        return {number: cls.load(path) for number, path in paths.items() if path.exists()}
+
+
+@dataclass(frozen=True)
+class Given(Kept):
+    """The generator's grasps of a scene, best first, and what became of them.
+
+    waypoints: (n, 10, 28) in the world frame. outcome: (n, 4) bool, columns FLAGS. penetration: (n,) metres.
+    """
+
+    object: str
+    category: str
+    waypoints: np.ndarray
+    outcome: np.ndarray
+    penetration: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.waypoints)
+
+    @property
+    def success(self) -> np.ndarray:
+        """Which hold, (n,)."""
+        return self.outcome[:, FLAGS.index("success")]
+
+
+@dataclass(frozen=True)
+class Refined(Kept):
+    """What one variant made of them, all (n,) but outcome (n, 4); the judge's scores are NaN where there was none.
+
+    cost: (2,) seconds of wall and of processor time.
+    """
+
+    replaced: np.ndarray
+    failed: np.ndarray
+    score_before: np.ndarray
+    score_after: np.ndarray
+    judge_before: np.ndarray
+    judge_after: np.ndarray
+    outcome: np.ndarray
+    penetration: np.ndarray
+    cost: np.ndarray
+
+    @property
+    def success(self) -> np.ndarray:
+        """Which hold, (n,)."""
+        return self.outcome[:, FLAGS.index("success")]
+
+    @property
+    def collided(self) -> np.ndarray:
+        """Which hit the table or what stands on it, (n,)."""
+        return self.outcome[:, FLAGS.index("collided")]
+
+    def first(self, rule: str) -> int:
+        """The row that a rule ranks first."""
+        return 0 if rule == GENERATOR else int(rank(self._result(), rule)[0])
+
+    def first_unrefined(self, rule: str) -> int:
+        """The row that the rule would rank first had nothing been refined."""
+        if rule == GENERATOR:
+            return 0
+        return int(rank(self._result(self.score_before, self.judge_before), rule)[0])
+
+    def _result(self, after: np.ndarray | None = None, judged: np.ndarray | None = None) -> Refinement:
+        """The scores in the form that ranking takes; the grasps play no part."""
+        count = len(self.replaced)
+        still, flag = Grasps(torch.eye(28)[3].expand(count, 10, 28), "world"), torch.zeros(count, dtype=torch.bool)
+        scores = (self.score_before, self.score_after if after is None else after)
+        opinions = (self.judge_before, self.judge_after if judged is None else judged)
+        known = not np.isnan(self.judge_before).any()
+        judges = [torch.tensor(opinion) if known else None for opinion in opinions]
+        return Refinement(still, *(torch.tensor(score) for score in scores), flag, flag, {}, *judges)
+
+
+def compared(given: dict[int, Given], done: dict[str, dict[int, Refined]]) -> dict[str, dict[str, Any]]:
+    """The figures of each variant, and on the scenes that it shares with the first one by how much it differs."""
+    base_name, base = next(iter(done.items()))
+    result = {}
+    for name, rows in done.items():
+        if not rows:
+            sys.stderr.write(f"{name}: nothing is done yet\n")
+            continue
+        result[name] = summarise([given[number] for number in rows], list(rows.values()))
+        shared = sorted(rows.keys() & base.keys())
+        if name != base_name and shared:
+            here, there = ([some[number] for number in shared] for some in (rows, base))
+            change = change_of(held(here), held(there))
+            result[name]["against"] = {"variant": base_name, "scenes": len(shared), "success": change}
+    return result
+
+
+def held(rows: list[Any]) -> Counts:
+    return np.array([row.success.sum() for row in rows]), np.array([len(row.success) for row in rows])
+
+
+def summarise(given: list[Given], rows: list[Refined]) -> dict[str, Any]:
+    before, after = held(given), held(rows)
+    was, now = (np.concatenate([row.success for row in some]) for some in (given, rows))
+    hit = np.concatenate([row.collided for row in rows])
+    was_hit = np.concatenate([row.outcome[:, FLAGS.index("collided")] for row in given])
+    fell, rose = int((was & ~now).sum()), int((~was & now).sum())
+    deep, then = (np.concatenate([row.penetration for row in some]) for some in (given, rows))
+    cost = np.array([row.cost for row in rows])
+    judged = not any(np.isnan(row.judge_before).any() for row in rows)
+    rules = [GENERATOR, *(name for name in RANKINGS if judged or name != "judge")]
+    return {
+        "scenes": len(rows),
+        "objects": len({row.object for row in given}),
+        "grasps": len(was),
+        "success_before": rate(resampled(before)),
+        "success_after": rate(resampled(after)),
+        "change": change_of(after, before),
+        "transitions": transitions(was, now, hit),
+        "gains_per_loss": rose / fell if fell else None,
+        "collided_before": int(was_hit.sum()),
+        "collided_after": int(hit.sum()),
+        "replaced": mean(np.concatenate([row.replaced for row in rows])),
+        "failed": int(np.concatenate([row.failed for row in rows]).sum()),
+        "score_higher": mean(np.concatenate([row.score_after > row.score_before for row in rows])),
+        "score_before": mean(np.concatenate([row.score_before for row in rows])),
+        "score_after": mean(np.concatenate([row.score_after for row in rows])),
+        "penetration_before": mean(deep),
+        "penetration_after": mean(then),
+        "penetration_change": change_of(*(depths(some) for some in (rows, given))),
+        "top1": {rule: top1(given, rows, rule) for rule in rules},
+        **{
+            name: {"median": float(np.median(spent)), "per_100_grasps": float(100 * spent.sum() / len(was))}
+            for name, spent in zip(("seconds", "processor_seconds"), cost.T, strict=True)
+        },
+    }
+
+
+def transitions(was: np.ndarray, now: np.ndarray, hit: np.ndarray) -> dict[str, int]:
+    """How many grasps went where (thesis, Tables 4.2 and 4.3)."""
+    fail = ~now & ~hit
+    return {
+        "success_to_success": int((was & now).sum()),
+        "success_to_fail": int((was & fail).sum()),
+        "success_to_collided": int((was & hit).sum()),
+        "fail_to_success": int((~was & now).sum()),
+        "fail_to_fail": int((~was & fail).sum()),
+        "fail_to_collided": int((~was & hit).sum()),
+    }
+
+
+def depths(rows: list[Any]) -> Counts:
+    """Metres in all and grasps of each scene, whose quotient is the mean."""
+    return np.array([row.penetration.sum() for row in rows]), np.array([len(row.penetration) for row in rows])
+
+
+def top1(given: list[Given], rows: list[Refined], rule: str) -> dict[str, Any]:
+    """How often the grasp that a rule ranks first holds: refined, and had nothing been refined; and the first's fate.
+
+    The transitions are those of the grasps chosen after refinement (thesis, Tables 4.4 to 4.6).
+    """
+    pairs = list(zip(given, rows, strict=True))
+    first = [row.first(rule) for row in rows]
+    ones = np.ones(len(rows))
+    plain = np.array([g.success[row.first_unrefined(rule)] for g, row in pairs], float), ones
+    was = np.array([g.success[i] for (g, _), i in zip(pairs, first, strict=True)])
+    now = np.array([row.success[i] for row, i in zip(rows, first, strict=True)])
+    hit = np.array([row.collided[i] for row, i in zip(rows, first, strict=True)])
+    refined = now.astype(float), ones
+    return {
+        "unrefined": rate(resampled(plain)),
+        "refined": rate(resampled(refined)),
+        "change": change_of(refined, plain),
+        "transitions": transitions(was, now, hit),
+    }

@@ -1,0 +1,111 @@
+"""What benchmarks/report.py writes of refinement, from the JSON of benchmarks/refine.py."""
+
+from typing import Any
+
+from generator_report import points, rate, share
+from tables import RESULTS, read, table
+
+RULES = {
+    "generator": "generator's first",
+    "before": "score before",
+    "after": "score after",
+    "lesser": "lesser of both",
+    "judge": "judge",
+    "mean": "mean of evaluator and judge",
+}
+MESHES = "### On objects from elsewhere\n\n"
+
+
+def refinement() -> str:
+    """What has been measured of refinement; each part as soon as its benchmark has been run."""
+    parts = {"refinement": whole, "refinement_meshes": lambda found: MESHES + whole(found), "refinement_cost": cost}
+    return "\n".join(write(read(name)) for name, write in parts.items() if (RESULTS / f"{name}.json").exists())
+
+
+def whole(found: dict[str, Any]) -> str:
+    """The tables of one run of the benchmark."""
+    variants = found["variants"]
+    name, first = next(iter(variants.items()))
+    judge = f"accepted by `{found['judge']}`" if found["judge"] else "accepted where the objective rises"
+    went = heads(first["transitions"])
+    rules = first["top1"]
+    return "\n".join(
+        [
+            f"`benchmarks/refine.py`; {first['scenes']} scenes of {first['objects']} objects ({found['split']}), at "
+            f"most {found['num_grasps']} grasps of the Kopicki generator each, {first['grasps']:,} in all; in "
+            f"{found['without_grasp']} more scenes it found none. Guided by `{found['evaluator']}`, {judge}. The same "
+            "trials before and after; the simulator selects nothing.\n",
+            outcomes(variants),
+            "Where the grasps went (thesis, Tables 4.2 and 4.3):\n",
+            table(("variant", *went), [(other, *row["transitions"].values()) for other, row in variants.items()]),
+            f"The grasp that each rule ranks first in a scene, by `{name}`, and what became of those chosen (thesis, "
+            "Tables 4.4 to 4.6):\n",
+            table(
+                ("ranked by", "holds unrefined", "holds refined", "change", *went),
+                [
+                    (RULES[rule], rate(row["unrefined"]), rate(row["refined"]), points(row["change"]),
+                     *row["transitions"].values())
+                    for rule, row in rules.items()
+                ],
+            ),
+            "The first of each scene after refinement, by variant:\n",
+            table(
+                ("variant", *(RULES[rule] for rule in rules)),
+                [
+                    (other, *(rate(row["top1"][rule]["refined"]) if rule in row["top1"] else "" for rule in rules))
+                    for other, row in variants.items()
+                ],
+            ),
+        ]
+    )  # fmt: skip
+
+
+def heads(names: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(name.replace("_to_", " to ") for name in names)
+
+
+def outcomes(variants: dict[str, Any]) -> str:
+    head = (
+        "variant", "grasps", "hold before", "hold after", "change", "against the first", "gains for a loss", "replaced",
+        "hit the table before", "after", "penetration before, mm", "after", "mean score before", "after",
+        "processor seconds for 100",
+    )  # fmt: skip
+    rows = [
+        (
+            name,
+            f"{row['grasps']:,}",
+            share(row["success_before"]["rate"]),
+            rate(row["success_after"]),
+            points(row["change"]),
+            points(row["against"]["success"]) if "against" in row else "",
+            "" if row["gains_per_loss"] is None else f"{row['gains_per_loss']:.1f}",
+            share(row["replaced"]),
+            row["collided_before"],
+            row["collided_after"],
+            *(f"{1000 * row[key]:.2f}" for key in ("penetration_before", "penetration_after")),
+            *(f"{row[key]:.3f}" for key in ("score_before", "score_after")),
+            f"{row['processor_seconds']['per_100_grasps']:.1f}",
+        )
+        for name, row in variants.items()
+    ]
+    return table(head, rows)
+
+
+def cost(found: dict[str, Any]) -> str:
+    whole, alone, density = (found[name] for name in ("whole", "evaluator_alone", "density"))
+    terms = found["processor_seconds_of_terms"]
+    keys = {"seconds": 1, "processor_seconds": 1, "peak_megabytes": 0}
+    rows = [(f"{row['grasps']:,}", *(f"{row[key]:.{n}f}" for key, n in keys.items())) for row in found["growth"]]
+    return "\n".join(
+        [
+            f"### Cost\n\n`benchmarks/refine_cost.py`; guided by `{found['evaluator']}`, {found['threads']} threads. "
+            f"100 grasps x {found['num_steps']} steps take {whole['seconds']:.1f} s and at most "
+            f"{whole['peak_megabytes']:.0f} MB with all that is loaded; the evaluator alone takes "
+            f"{alone['seconds']:.1f} s. The density behind the prior is made once for a view, in "
+            f"{density['seconds']:.1f} s. Processor seconds that each term adds to the evaluator's "
+            f"{alone['processor_seconds']:.1f}:\n",
+            table(tuple(name.replace("_", " ") for name in terms), [tuple(f"{value:.2f}" for value in terms.values())]),
+            f"In {found['few_steps']} steps:\n",
+            table(("grasps", "seconds", "processor seconds", "MB at most"), rows),
+        ]
+    )

@@ -1,0 +1,149 @@
+"""Learning from its own output: refined grasps of training objects, tried in simulation, become part of a grasp set.
+
+An evaluator is wrong where it has seen nothing, and that is where climbing it leads (thesis, section 4.4). What became
+of the grasps that it liked best is what it has to learn next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+
+from dexzoo.data.grasp_set import GraspSet
+from dexzoo.data.rendering import rebuild
+from dexzoo.data.schema import SCHEMAS, decode_path, encode_path
+from dexzoo.data.workers import in_processes
+from dexzoo.data.writer import GraspSetWriter, grasp_rows
+from dexzoo.generators.kopicki import KopickiGenerator
+from dexzoo.hand import default_hand
+from dexzoo.models.evaluator import GraspEvaluator
+from dexzoo.models.zoo import load
+from dexzoo.refinement import refine
+from dexzoo.sim import Outcomes, trial
+
+SLICE_SCENES = 20
+"""Scenes of consecutive numbers whose refined grasps share a file."""
+
+
+@dataclass(frozen=True)
+class Refining:
+    """What refined grasps depend on, besides the program and the set.
+
+    evaluator: what guides, as `dexzoo.load` takes it. round: tells one evaluator's grasps from the next one's.
+    num_grasps: of each scene, drawn among the generated ones.
+    """
+
+    evaluator: str
+    round: int = 1
+    seed: int = 0
+    num_grasps: int = 40
+
+    def part(self, number: int) -> str:
+        """Name of the file of a slice."""
+        return f"refined{self.round}_{number:05d}"
+
+
+def collect_refined(folder: Path, how: Refining, workers: int = 1) -> Iterator[str]:
+    """Refine grasps of the set's training scenes, try them and add them, slice by slice; yields a line on each.
+
+    Slices that are there are left alone, so that a round can be continued; start a new one for another evaluator. The
+    files are the same on any number of workers. A refined grasp is paired with the view that it was refined on. Grasps
+    that refinement did not replace are in the set already.
+    Raises what `GraspSet`, `GraspSetWriter` and `dexzoo.load` raise, ValueError for a set without simulated training
+    scenes.
+    """
+    load(how.evaluator)  # whether it can be
+    numbers = slices(folder)
+    with GraspSetWriter(folder, {}, 0) as writer:
+        there = [number for number in numbers if f"grasps/{how.part(number)}.parquet" in writer.manifest["files"]]
+        missing = [number for number in numbers if number not in there]
+        yield from (f"{how.part(number)} is there already" for number in there)
+        if missing:
+            for number, table in in_processes(partial(make_slice, folder, how), missing, workers):
+                writer.add_grasps(how.part(number), table)
+                held = table["success"].to_numpy().sum()
+                yield f"{how.part(number)}: {table.num_rows} refined grasps, {held} of which hold"
+
+
+def slices(folder: Path) -> list[int]:
+    """Numbers of the slices that hold training scenes. ValueError where there are none."""
+    scenes = GraspSet(folder).scenes
+    pairs = zip(scenes["scene"].to_pylist(), scenes["split"].to_pylist(), strict=True)
+    found = sorted({scene // SLICE_SCENES for scene, split in pairs if split == "train"})
+    if not found:
+        raise ValueError(f"grasp set {folder} has no scenes of training objects; only these are refined")
+    return found
+
+
+def make_slice(folder: Path, how: Refining, number: int) -> tuple[int, pa.Table]:
+    """The number again, and the refined grasps of a slice's training scenes as rows of the table of grasps."""
+    grasp_set = _open(folder)
+    parts = [SCHEMAS["grasps"].empty_table()]
+    for row, scene in enumerate(grasp_set.scenes.to_pylist()):
+        if scene["split"] == "train" and scene["scene"] // SLICE_SCENES == number:
+            parts.append(refined_rows(grasp_set, row, how))
+    return number, pa.concat_tables(parts)
+
+
+def refined_rows(grasp_set: GraspSet, row: int, how: Refining) -> pa.Table:
+    """Refined grasps of one scene, by its row, as rows of the table of grasps; none where its view shows too little.
+
+    Raises ValueError for a scene that was not simulated.
+    """
+    scene = grasp_set.scenes.slice(row, 1).to_pylist()[0]
+    rng = np.random.default_rng([how.seed, how.round, scene["scene"]])
+    generated = np.flatnonzero((grasp_set.grasp_scene == row) & (grasp_set.source == "generated"))
+    chosen = np.sort(rng.choice(generated, min(how.num_grasps, len(generated)), replace=False))
+    view = grasp_set.views.slice(int(rng.choice(np.flatnonzero(grasp_set.view_scene == row))), 1).to_pylist()[0]
+    stage = rebuild(scene)
+    if view["seed"] is None:
+        raise ValueError(f"view {view['view']} of scene {scene['scene']} has no seed, so it cannot be seen again")
+    observation = stage.observe(view["seed"])
+    try:
+        density = _generator().density(observation)
+    except ValueError:  # too few points
+        return SCHEMAS["grasps"].empty_table()
+    hand = default_hand()
+    columns = grasp_set.grasps.take(pa.array(chosen))
+    kinds, ranks = (torch.tensor(columns[name].to_numpy()) for name in ("grasp_type", "rank"))
+    given = decode_path(grasp_set.paths[chosen], kinds, hand)
+    result = refine(given, observation, _load(how.evaluator), density=density, seed=how.seed)
+    kinds, ranks = kinds[result.accepted], ranks[result.accepted]
+    # what is simulated is what will be read, to the last bit
+    path = encode_path(result.grasps[result.accepted], hand)
+    outcomes = trial.run(stage, decode_path(path, kinds, hand), hand, num_threads=1)
+    found: dict[str, Any] = {field.name: getattr(outcomes, field.name) for field in fields(Outcomes)}
+    return grasp_rows(
+        scene["scene"],
+        found
+        | {
+            "view": [view["view"]] * len(path),
+            "grasp_type": kinds.numpy(),
+            "source": ["refined"] * len(path),
+            "rank": ranks.numpy(),
+            "path": path,
+            "success_rate": [None] * len(path),
+        },
+    )
+
+
+@cache
+def _open(folder: Path) -> GraspSet:
+    return GraspSet(folder)
+
+
+@cache
+def _load(evaluator: str) -> GraspEvaluator:
+    return load(evaluator)
+
+
+@cache
+def _generator() -> KopickiGenerator:
+    return KopickiGenerator()

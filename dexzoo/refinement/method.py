@@ -1,0 +1,201 @@
+"""Refinement: propose by climbing an objective, accept if an evaluator that did not guide the climb agrees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dexzoo.camera import Camera, Observation
+from dexzoo.generators.density import GraspDensity
+from dexzoo.generators.kopicki import KopickiGenerator
+from dexzoo.grasp import GRIP, POSITION, Grasps, transform_waypoints
+from dexzoo.hand import default_hand
+from dexzoo.models.evaluator import GraspEvaluator, PreparedView
+from dexzoo.models.zoo import load
+from dexzoo.refinement.climb import CHUNK, OnStep, Settings, Trace, climb
+from dexzoo.refinement.objective import Objective, Terms, Weights
+from dexzoo.refinement.optimisers import BY_GRADIENT
+from dexzoo.refinement.variables import Region
+
+MIN_RISE = 1e-4
+"""Log-odds by which the objective must rise; less may be rounding."""
+MAX_DISTANCE = 0.3
+"""Metres between palm and object beyond which no hand grasps: the grasps are in another frame than they say."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What became of each grasp; tensors (num_grasps,).
+
+    grasps: the refined grasp where accepted, else the one given; same order and frame as given. The log-likelihood
+    stays that of the grasp that was proposed.
+    score_before, score_after: probability of success of the given and of the returned grasps.
+    accepted: whether the grasp was replaced. failed: whether the objective was no finite number on the way; such a
+    grasp is at its last good state, or as given.
+    penalties: of the returned grasps, the terms of `Weights` that had a weight, "prior" and "spread" among them.
+    judge_before, judge_after: the judge's probabilities, None without a judge. trace: None unless asked for.
+    """
+
+    grasps: Grasps
+    score_before: Float[Tensor, " grasp"]
+    score_after: Float[Tensor, " grasp"]
+    accepted: Bool[Tensor, " grasp"]
+    failed: Bool[Tensor, " grasp"]
+    penalties: Terms
+    judge_before: Float[Tensor, " grasp"] | None = None
+    judge_after: Float[Tensor, " grasp"] | None = None
+    trace: Trace | None = None
+
+
+def refine(
+    grasps: Grasps,
+    depth: NDArray[np.floating] | Observation,
+    evaluator: str | GraspEvaluator = "em2",
+    camera: Camera | None = None,
+    *,
+    judge: str | GraspEvaluator | None = None,
+    margin: float = 0.0,
+    optimiser: Literal["adam", "lbfgs", "metropolis", "random"] = "adam",
+    num_steps: int = 20,
+    step_size: float = 0.2,
+    variables: Literal["grip", "uncoupled", "waypoints"] = "grip",
+    region: Region | None = None,
+    weights: Weights | None = None,
+    density: GraspDensity | None = None,
+    seed: int = 0,
+    keep_trace: bool = False,
+    on_step: OnStep | None = None,
+) -> Refinement:
+    """Improve grasps on one depth image.
+
+    grasps: in the frame of the depth image's camera, or of its world. depth: (height, width) metres with its camera, or
+    an Observation. evaluator: what guides: a model, or what `dexzoo.load` takes.
+    judge: another such, which does not guide, but must find the log-odds of a refined grasp higher by more than
+    `margin` for it to be accepted. Without one, it is enough that the objective rises.
+    optimiser, num_steps, step_size: how many states are evaluated besides the first of each half; a step moves a number
+    by about `step_size` of its half of the trust region. The first half of the steps moves the wrist, the second the
+    fingers.
+    variables: what is moved, see `dexzoo.refinement.variables`. region: how far. weights: what counts how much.
+    density: `KopickiGenerator.density` of the view, where it is at hand; it is made if the prior has a weight.
+    seed: of the random optimisers. keep_trace: whether all states are handed back. on_step: called with the step, from
+    0, and the objective of the grasps in work, 50 at a time.
+    Raises ValueError in one line for arguments that do not fit together, an evaluator without gradients, grasps that
+    cannot be in the frame that they say, and joints outside their limits.
+    """
+    settings = Settings(optimiser, variables, region or Region(), num_steps, step_size)
+    weights = weights or Weights()
+    observation = as_observation(depth, camera)
+    world = checked_in_world(grasps, observation)
+    model = load(evaluator) if isinstance(evaluator, str) else evaluator
+    second = load(judge) if isinstance(judge, str) else judge
+    if not len(grasps):
+        return _of_none(grasps, second is not None)
+    view = model.eval().prepare(observation)
+    if optimiser in BY_GRADIENT:
+        _check_gradient(view, world[:1])
+    if weights.prior and density is None:
+        density = _generator().density(observation)
+    objective = Objective(view, observation, default_hand(), weights, density)
+    found = climb(objective, world, settings, seed, keep_trace, on_step)
+
+    accepted = found.rise > MIN_RISE  # never of NaN
+    opinion = None
+    if second is not None:
+        other = second.eval().prepare(observation)
+        opinion = log_odds(other, world), log_odds(other, found.waypoints)
+        accepted &= opinion[1] - opinion[0] > margin
+
+    def kept(before: Tensor, after: Tensor) -> Tensor:
+        return torch.where(accepted, after, before)
+
+    judged: tuple[Tensor | None, Tensor | None] = None, None
+    if second is not None and opinion is not None:
+        judged = second.probability(opinion[0]), second.probability(kept(*opinion))
+    before, after = found.before["log_odds"], found.after["log_odds"]
+    return Refinement(
+        replaced(grasps, found.waypoints, accepted, observation),
+        model.probability(before),
+        model.probability(kept(before, after)),
+        accepted,
+        found.failed,
+        {name: kept(found.before[name], found.after[name]) for name in found.before if name != "log_odds"},
+        *judged,
+        None if found.trace is None else _trace_in_frame(found.trace, grasps, observation),
+    )
+
+
+def as_observation(depth: NDArray[np.floating] | Observation, camera: Camera | None) -> Observation:
+    """The view that a depth array or an Observation is. ValueError unless the camera is given with an array only."""
+    if isinstance(depth, Observation):
+        if camera is not None:
+            raise ValueError("give a camera with a depth array only; an Observation has its own")
+        return depth
+    if camera is None:
+        raise ValueError("a depth array needs its camera: refine(grasps, depth, camera=camera)")
+    return Observation(depth, camera)
+
+
+def checked_in_world(grasps: Grasps, observation: Observation) -> Float[Tensor, "grasp 10 28"]:
+    """Waypoints in the world frame. ValueError for joints beyond their limits or palms far from the object."""
+    default_hand().check(grasps.joints)
+    world = grasps.to_frame("world", observation.T_world_camera).waypoints.detach()
+    points = torch.from_numpy(observation.points_world[:: len(observation.points_world) // 500 + 1].copy())
+    far = torch.cdist(world[:, GRIP, POSITION].float(), points).amin(-1)
+    if len(far) and far.max() > MAX_DISTANCE:
+        row = int(far.argmax())
+        raise ValueError(
+            f"the palm of grasp {row} is {float(far[row]):.2f} m from the object at the grip, out of reach; are the "
+            f"grasps of this view, and in the {grasps.frame} frame as they say?"
+        )
+    return world
+
+
+def replaced(grasps: Grasps, world: Tensor, accepted: Tensor, observation: Observation) -> Grasps:
+    """The grasps, those accepted replaced by waypoints in the world frame, the others the same to the bit."""
+    waypoints = grasps.waypoints.detach().clone()
+    new = Grasps(world[accepted], "world").to_frame(grasps.frame, observation.T_world_camera)
+    waypoints[accepted] = new.waypoints
+    return Grasps(waypoints, grasps.frame, grasps.log_likelihood)
+
+
+@torch.no_grad()
+def log_odds(view: PreparedView, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
+    """Log-odds of waypoints in the world frame, a chunk at a time."""
+    return torch.cat([view.logit(part) for part in waypoints.split(CHUNK)])
+
+
+@lru_cache(maxsize=1)
+def _generator() -> KopickiGenerator:
+    return KopickiGenerator()
+
+
+def _check_gradient(view: PreparedView, waypoints: Tensor) -> None:
+    free = waypoints.clone().requires_grad_()
+    with torch.enable_grad():
+        logit = view.logit(free)
+    known = logit.requires_grad and torch.autograd.grad(logit.sum(), free, allow_unused=True)[0] is not None
+    if not known:
+        raise ValueError(
+            f"evaluator {view.evaluator.architecture} has no gradient in the grasps; use the optimiser metropolis or "
+            "random, or another evaluator"
+        )
+
+
+def _trace_in_frame(trace: Trace, grasps: Grasps, observation: Observation) -> Trace:
+    if grasps.frame == "world":
+        return trace
+    T = torch.linalg.inv(torch.from_numpy(observation.T_world_camera)).to(trace.waypoints)
+    return Trace(transform_waypoints(T, trace.waypoints), trace.objective)
+
+
+def _of_none(grasps: Grasps, judged: bool) -> Refinement:
+    value, flag = torch.zeros(0), torch.zeros(0, dtype=torch.bool)
+    opinion = (value, value) if judged else (None, None)
+    return Refinement(grasps, value, value, flag, flag, {}, *opinion)

@@ -1,0 +1,123 @@
+"""What refined grasps pay for: hand in the object, in its shadow, in the table, in itself; and what they are like.
+
+Everything is looked at in the palm's frame: it is quicker to bring points and planes there than all links to the world.
+What lies near a grasp is sought once and serves as long as the grasp stays in its trust region.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dexzoo.camera import Observation
+from dexzoo.generators.density import GraspDensity, Grips
+from dexzoo.generators.generator import MIN_CLEARANCE
+from dexzoo.generators.surroundings import obstacles, underneath
+from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, pose_matrix
+from dexzoo.hand import Hand
+
+MOMENTS = [PREGRASP, GRIP // 2, GRIP]
+"""The waypoints at which the hand is looked at; beyond the grip it is meant to press."""
+AT_OBJECT = 1
+"""The first of these at which it can be in the object."""
+NUM_OBSERVED, NUM_SHADOW = 256, 128
+SHADOW_DEPTHS = (0.007, 0.014)
+"""Metres behind the observed surface, along the line of sight, at which the object is taken to go on."""
+NUM_NEAR = 64
+"""Points of a kind that are looked at around each hand; with more it takes longer and tells little else."""
+
+
+class Surroundings:
+    """The points around a view that a hand should not be in, in the world frame.
+
+    observed: of the object. shadow: behind them. others: of what else is seen on the table, or guessed to carry the
+    object.
+    """
+
+    def __init__(self, observation: Observation) -> None:
+        points = torch.from_numpy(observation.points_world)
+        self.observed = _evenly(points, NUM_OBSERVED)
+        camera = torch.tensor(observation.T_world_camera[:3, 3], dtype=torch.float32)
+        some = _evenly(points, NUM_SHADOW)
+        sight = torch.nn.functional.normalize(some - camera, dim=-1)
+        behind = torch.cat([some + depth * sight for depth in SHADOW_DEPTHS])
+        self.shadow = behind[behind[:, 2] > 0]
+        self.others = torch.cat((obstacles(observation), underneath(points)))
+
+
+def _evenly(points: Tensor, num: int) -> Tensor:
+    """A fixed even choice of at most `num`."""
+    return points[torch.from_numpy(np.linspace(0, len(points) - 1, min(num, len(points))).astype(int))]
+
+
+class Posed:
+    """Hands at `MOMENTS`: wrist (grasp, moment, 4, 4) in the world, links (grasp, moment, link, 4, 4) in the palm."""
+
+    def __init__(self, hand: Hand, waypoints: Float[Tensor, "grasp 10 28"]) -> None:
+        way = waypoints[:, MOMENTS]
+        self.hand = hand
+        self.wrist = pose_matrix(way[..., POSITION], way[..., QUATERNION])
+        self.links = hand.forward_kinematics(way[..., JOINTS])
+
+    def distance(self, points: Tensor, first: int = 0) -> Float[Tensor, "grasp moment solid point"]:
+        """Metres from points of the world (*cloud, n, 3) to each link, negative inside, from one moment on."""
+        wrist = self.wrist[:, first:]
+        in_palm = (points - wrist[..., None, :3, 3]) @ wrist[..., :3, :3]
+        return self.hand.signed_distance(self.links[:, first:], in_palm)
+
+    @torch.no_grad()
+    def nearest(self, points: Float[Tensor, "point 3"], first: int = 0) -> Float[Tensor, "grasp moment near 3"]:
+        """The points nearest to any link at each moment, from one on."""
+        num = min(NUM_NEAR, len(points))
+        return points[self.distance(points, first).amin(-2).topk(num, largest=False, sorted=False).indices]
+
+    def penetration(self, near: Float[Tensor, "grasp moment near 3"]) -> Float[Tensor, " grasp"]:
+        """Metres that the deepest point lies in each link, summed over links and moments."""
+        return (-self.distance(near, AT_OBJECT).amin(-1)).clamp_min(0).sum((-1, -2))
+
+    def table(self, near: Float[Tensor, "grasp moment near 3"]) -> Float[Tensor, " grasp"]:
+        """Metres that each link lacks of its clearance from the table and what stands on it, summed likewise."""
+        # the third row of a pose is the table's plane in the palm frame
+        clearance = self.hand.clearance(self.links, self.wrist[..., 2, :])
+        if near.shape[-2]:
+            clearance = torch.minimum(clearance, self.distance(near).amin(-1))
+        return (MIN_CLEARANCE - clearance).clamp_min(0).sum((-1, -2))
+
+    def self_collision(self) -> Float[Tensor, " grasp"]:
+        """Metres that links overlap at the grip, summed over pairs."""
+        return (-self.hand.self_distance(self.links[:, -1])).clamp_min(0).sum(-1)
+
+
+class Prior:
+    """The generator's own log-density of grips, each by the demonstration that it is likeliest to come from.
+
+    Grasps of a type that nobody has demonstrated have none: their value is 0, whatever they do.
+    """
+
+    def __init__(self, density: GraspDensity, waypoints: Float[Tensor, "grasp 10 28"]) -> None:
+        self.density = density
+        types = torch.tensor([demonstration.grasp_type for demonstration in density.demonstrations])
+        grasp, demo = (waypoints[:, 0, -1:].round().long() == types).nonzero(as_tuple=True)
+        with torch.no_grad():
+            each = waypoints.new_full((len(waypoints), len(types)), -torch.inf)
+            if len(grasp):
+                each[grasp, demo] = density.log_likelihood(self._grips(waypoints[grasp], demo))
+        self.known = torch.isfinite(each).any(-1).nonzero().squeeze(-1)
+        self.demo = each[self.known].argmax(-1)
+        self.near = density.neighbours(self._grips(waypoints[self.known], self.demo)) if len(self.known) else None
+
+    def __call__(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
+        """Log-density of grips near those that the prior was made around; differentiable."""
+        value = waypoints.new_zeros(len(waypoints))
+        if self.near is None:
+            return value
+        grips = self._grips(waypoints[self.known], self.demo)
+        return value.index_put((self.known,), self.density.log_likelihood(grips, self.near))
+
+    def _grips(self, waypoints: Tensor, demo: Tensor) -> Grips:
+        grip = waypoints[:, GRIP]
+        return Grips(
+            demo, pose_matrix(grip[:, POSITION], grip[:, QUATERNION]), self.density.hand.reduce(grip[:, JOINTS])
+        )

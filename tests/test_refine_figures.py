@@ -1,0 +1,64 @@
+"""The figures of the benchmark of refinement, against a count by hand."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch):  # noqa: ANN201, a module
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    import refine_figures
+
+    yield refine_figures
+    for name in ("refine_figures", "generator_figures"):
+        sys.modules.pop(name, None)
+
+
+def scene(figures, before: str, after: str, scores: list[float], later: list[float]):  # noqa: ANN001, ANN201
+    """A scene's grasps as given and refined: s holds, f fails, c hits the table."""
+
+    def outcome(letters: str) -> np.ndarray:
+        return np.array([[x == "s", x == "c", False, False] for x in letters])
+
+    count = len(before)
+    given = figures.Given("can_00", "can", np.zeros((count, 10, 28)), outcome(before), np.full(count, 0.002))
+    nan, flag = np.full(count, np.nan), np.zeros(count, bool)
+    cost = np.array([2.0, 3.0])
+    row = figures.Refined(
+        ~flag, flag, np.array(scores), np.array(later), nan, nan, outcome(after), np.full(count, 0.001), cost
+    )
+    return given, row
+
+
+def test_outcomes_are_counted_as_in_the_thesis(figures, tmp_path: Path) -> None:  # noqa: ANN001
+    first = scene(figures, "sffs", "sscf", [0.1, 0.4, 0.3, 0.2], [0.2, 0.1, 0.9, 0.3])
+    second = scene(figures, "fs", "fc", [0.5, 0.6], [0.7, 0.6])
+    for number, (given, row) in enumerate((first, second)):
+        given.save(tmp_path / "given" / f"{number:03d}.npz")
+        row.save(tmp_path / "method" / f"{number:03d}.npz")
+    given = figures.Given.load_all(tmp_path / "given", 5)
+    found = figures.compared(given, {"method": figures.Refined.load_all(tmp_path / "method", 5), "new": {}})
+    assert list(found) == ["method"]
+    row = found["method"]
+    assert row["grasps"] == 6
+    assert row["success_before"]["rate"] == pytest.approx(3 / 6)
+    assert row["success_after"]["rate"] == pytest.approx(2 / 6)
+    assert row["change"]["rate"] == pytest.approx(-1 / 6)
+    assert row["change"]["interval"] == pytest.approx([-1 / 2, 0])  # one scene twice, or the other
+    assert list(row["transitions"].values()) == [1, 1, 1, 1, 1, 1]
+    assert row["gains_per_loss"] == pytest.approx(1 / 2)
+    assert (row["collided_before"], row["collided_after"]) == (0, 2)
+    assert (row["penetration_before"], row["penetration_after"]) == pytest.approx((0.002, 0.001))
+    assert row["processor_seconds"]["per_100_grasps"] == pytest.approx(100)
+    top = row["top1"]
+    assert set(top) == {"generator", "before", "after", "lesser", "mean"}  # there was no judge
+    assert [top[rule]["refined"]["rate"] for rule in ("generator", "before", "after")] == [0.5, 0.5, 0.0]
+    assert [top[rule]["unrefined"]["rate"] for rule in ("generator", "before", "after")] == [0.5, 0.5, 0.5]
+    assert top["before"]["transitions"]["fail_to_success"] == 1
+    assert top["before"]["transitions"]["success_to_collided"] == 1
+    assert top["after"]["transitions"]["fail_to_collided"] == 1
