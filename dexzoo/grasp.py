@@ -233,6 +233,11 @@ def step_pose(
     return pose @ pose_matrix(step[..., :3], rotation.exp(step[..., 3:]))
 
 
+def in_frame(pose: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "*cloud point 3"]) -> Tensor:
+    """Points in the frames of poses, which they broadcast against: quicker than to bring a whole hand to the points."""
+    return (points - pose[..., None, :3, 3]) @ pose[..., :3, :3]
+
+
 def transform_waypoints(
     T_a_b: Float[Tensor, "*pose 4 4"], waypoints: Float[Tensor, "*batch 10 28"]
 ) -> Float[Tensor, "*batch 10 28"]:

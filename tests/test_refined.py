@@ -50,7 +50,7 @@ def in_this_process(generator: KopickiGenerator, monkeypatch: pytest.MonkeyPatch
         return map(function, numbers)
 
     monkeypatch.setattr(refined, "in_processes", one_by_one)
-    monkeypatch.setattr(refined, "_generator", lambda: generator)
+    monkeypatch.setattr(refined, "default_generator", lambda: generator)
 
 
 @pytest.fixture

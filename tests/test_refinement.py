@@ -144,7 +144,7 @@ def test_the_spread_of_an_ensemble_is_avoided(can_view: Observation, grasps: Gra
 
 
 def test_the_prior_draws_towards_the_demonstrations(can_view: Observation, grasps: Grasps) -> None:
-    generator = method._generator()
+    generator = method.default_generator()
     density = generator.density(can_view)
     weights = replace(NOTHING, prior=1.0)
     result = refine(grasps, can_view, Known(indifferent), weights=weights, density=density)
@@ -163,7 +163,7 @@ def test_terms_without_weight_are_not_looked_at(
 ) -> None:
     for name in ("penetration", "table", "self_collision", "nearest"):
         monkeypatch.setattr(Posed, name, lambda *_, name=name, **__: pytest.fail(f"{name} was looked at"))
-    monkeypatch.setattr(method, "_generator", lambda: pytest.fail("a density was made"))
+    monkeypatch.setattr(method, "default_generator", lambda: pytest.fail("a density was made"))
     monkeypatch.setattr(Known, "logit_and_spread", lambda *_: pytest.fail("the spread was asked for"))
     result = refine(grasps, can_view, Known(nearness), weights=NOTHING, num_steps=4)
     assert result.penalties == {}

@@ -21,7 +21,7 @@ from dexzoo.data.rendering import rebuild
 from dexzoo.data.schema import SCHEMAS, decode_path, encode_path
 from dexzoo.data.workers import in_processes
 from dexzoo.data.writer import GraspSetWriter, grasp_rows
-from dexzoo.generators.kopicki import KopickiGenerator
+from dexzoo.generators import default_generator
 from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
@@ -107,7 +107,7 @@ def refined_rows(grasp_set: GraspSet, row: int, how: Refining) -> pa.Table:
         raise ValueError(f"view {view['view']} of scene {scene['scene']} has no seed, so it cannot be seen again")
     observation = stage.observe(view["seed"])
     try:
-        density = _generator().density(observation)
+        density = default_generator().density(observation)
     except ValueError:  # too few points
         return SCHEMAS["grasps"].empty_table()
     hand = default_hand()
@@ -142,8 +142,3 @@ def _open(folder: Path) -> GraspSet:
 @cache
 def _load(evaluator: str) -> GraspEvaluator:
     return load(evaluator)
-
-
-@cache
-def _generator() -> KopickiGenerator:
-    return KopickiGenerator()

@@ -30,3 +30,10 @@ def make_generator(name: str) -> GraspGenerator:
         return KopickiGenerator(load_demonstrations(name))
     known = ", ".join(_GENERATORS)
     raise ValueError(f"generator {name!r} is unknown; use one of {known}, or a folder of demonstrations")
+
+
+def default_generator() -> KopickiGenerator:
+    """The one that `make_generator` gives as kopicki, whose density is the prior of refinement."""
+    generator = make_generator("kopicki")
+    assert isinstance(generator, KopickiGenerator)
+    return generator

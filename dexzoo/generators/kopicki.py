@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from dexzoo import rotation
@@ -23,7 +22,7 @@ from dexzoo.generators.features import Features
 from dexzoo.generators.generator import MAX_REACH, MIN_CLEARANCE, GraspGenerator, spread
 from dexzoo.generators.search import anneal, climb
 from dexzoo.generators.surroundings import obstacles, underneath
-from dexzoo.grasp import GRIP, PREGRASP, SQUEEZE, Grasps, pose_matrix
+from dexzoo.grasp import GRIP, PREGRASP, SQUEEZE, Grasps, in_frame, pose_matrix
 from dexzoo.hand import Hand, default_hand
 
 NUM_FEATURES = 1000
@@ -168,14 +167,14 @@ class Way:
 
     def table_cost_near(self, grips: Grips) -> Callable[[Grips], Tensor]:
         """`table_cost` for grips that stay near these ones, by the nearest points alone."""
-        distance = self.hand.signed_distance(self._links(grips), _in_palm(grips.wrist, self.others)).amin(-2)
+        distance = self.hand.signed_distance(self._links(grips), in_frame(grips.wrist, self.others)).amin(-2)
         nearest = distance.topk(min(NUM_NEAR, len(self.others)), largest=False, sorted=False).indices
         return partial(self.table_cost, others=self.others[nearest])
 
     def cost(self, grips: Grips) -> Tensor:
         """Kopicki's cost of collisions with the observed points on the way, besides that of the table."""
         wrist, links = self._path(grips, COLLISION_STEPS)
-        distance = self.hand.signed_distance(links, _in_palm(wrist, self.points))
+        distance = self.hand.signed_distance(links, in_frame(wrist, self.points))
         depth = (-distance.amin(-2)).clamp_min(0)
         weight = torch.tensor(COLLISION_WEIGHTS)[:, None]
         return self.table_cost(grips) + (weight * (torch.expm1(100 * depth))).sum((-1, -2)) * COLLISION_COST
@@ -186,7 +185,7 @@ class Way:
         The product of experts knows where links may be, but only as sharply as its kernels are wide.
         """
         pairs = zip(self._links(grips).split(64), grips.wrist.split(64), strict=True)
-        parts = [self.hand.signed_distance(links, _in_palm(wrist, self.surface)).amin(-1) for links, wrist in pairs]
+        parts = [self.hand.signed_distance(links, in_frame(wrist, self.surface)).amin(-1) for links, wrist in pairs]
         gap = torch.stack([torch.cat(parts)[:, solids].amin(-1) for solids in self.finger_solids], -1)
         return (self.gap_weight[grips.demo] * gap.abs()).sum(-1)
 
@@ -234,12 +233,7 @@ class Way:
         clearance = self.hand.clearance(links, wrist[..., 2, :]).amin(-1)
         if not others.shape[-2]:
             return clearance
-        return torch.minimum(clearance, self.hand.signed_distance(links, _in_palm(wrist, others)).amin((-1, -2)))
-
-
-def _in_palm(wrist: Tensor, points: Tensor) -> Float[Tensor, "*batch point 3"]:
-    """Points (*batch, n, 3) in the palm frames of wrist poses (*batch, 4, 4)."""
-    return (points - wrist[..., None, :3, 3]) @ wrist[..., :3, :3]
+        return torch.minimum(clearance, self.hand.signed_distance(links, in_frame(wrist, others)).amin((-1, -2)))
 
 
 def _some(points: Tensor, num: int, generator: torch.Generator) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dexzoo.camera import Camera, Observation
+from dexzoo.generators import default_generator
 from dexzoo.generators.density import GraspDensity
-from dexzoo.generators.kopicki import KopickiGenerator
 from dexzoo.grasp import GRIP, POSITION, Grasps, transform_waypoints
 from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator, PreparedView
@@ -101,7 +100,7 @@ def refine(
     if optimiser in BY_GRADIENT:
         _check_gradient(view, world[:1])
     if weights.prior and density is None:
-        density = _generator().density(observation)
+        density = default_generator().density(observation)
     objective = Objective(view, observation, default_hand(), weights, density)
     found = climb(objective, world, settings, seed, keep_trace, on_step)
 
@@ -169,11 +168,6 @@ def replaced(grasps: Grasps, world: Tensor, accepted: Tensor, observation: Obser
 def log_odds(view: PreparedView, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
     """Log-odds of waypoints in the world frame, a chunk at a time."""
     return torch.cat([view.logit(part) for part in waypoints.split(CHUNK)])
-
-
-@lru_cache(maxsize=1)
-def _generator() -> KopickiGenerator:
-    return KopickiGenerator()
 
 
 def _check_gradient(view: PreparedView, waypoints: Tensor) -> None:

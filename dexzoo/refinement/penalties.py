@@ -15,7 +15,7 @@ from dexzoo.camera import Observation
 from dexzoo.generators.density import GraspDensity, Grips
 from dexzoo.generators.generator import MIN_CLEARANCE
 from dexzoo.generators.surroundings import obstacles, underneath
-from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, pose_matrix
+from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, in_frame, pose_matrix
 from dexzoo.hand import Hand
 
 MOMENTS = [PREGRASP, GRIP // 2, GRIP]
@@ -64,8 +64,7 @@ class Posed:
     def distance(self, points: Tensor, first: int = 0) -> Float[Tensor, "grasp moment solid point"]:
         """Metres from points of the world (*cloud, n, 3) to each link, negative inside, from one moment on."""
         wrist = self.wrist[:, first:]
-        in_palm = (points - wrist[..., None, :3, 3]) @ wrist[..., :3, :3]
-        return self.hand.signed_distance(self.links[:, first:], in_palm)
+        return self.hand.signed_distance(self.links[:, first:], in_frame(wrist, points))
 
     @torch.no_grad()
     def nearest(self, points: Float[Tensor, "point 3"], first: int = 0) -> Float[Tensor, "grasp moment near 3"]:
