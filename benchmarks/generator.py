@@ -121,7 +121,7 @@ def main() -> None:
         folder = options.folder / f"{'meshes' if options.meshes else options.split}_{options.num_grasps}"
         if not options.done:
             run({name: known[name] for name in options.variants}, setting, folder, options.scenes, options.num_grasps)
-        done = {name: load(folder / name, options.scenes) for name in options.variants}
+        done = {name: Trials.load_all(folder / name, options.scenes) for name in options.variants}
         if not done[options.variants[0]]:
             parser.error(f"folder {folder} holds nothing of {options.variants[0]}; run without --done first")
         result = {
@@ -224,12 +224,6 @@ def timed(generator: GraspGenerator, view: Observation, seed: int, num: int) -> 
         grasps, error = Grasps(torch.zeros(0, 10, 28), "camera"), str(reason)
     megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return grasps, np.array([time.perf_counter(), time.process_time(), megabytes]) - start, error
-
-
-def load(folder: Path, scenes: int) -> dict[int, Trials]:
-    """What was done in the first so many scenes, by the scene's number."""
-    paths = {number: folder / f"{number:03d}.npz" for number in range(scenes)}
-    return {number: Trials.load(path) for number, path in paths.items() if path.exists()}
 
 
 def growth(setting: Setting) -> dict[str, Any]:

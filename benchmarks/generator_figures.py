@@ -5,7 +5,7 @@ import sys
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -20,8 +20,31 @@ FLAGS = ("success", "collided", "starts_inside", "unstable")
 COSTS = ("seconds", "processor_seconds", "peak_megabytes")
 
 
+class Kept:
+    """Arrays that go to a file for each scene."""
+
+    def save(self, path: Path) -> None:
+        """Write aside and rename, so that a file is there only when it is whole."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside = path.with_name(f".{os.getpid()}_{path.name}")
+        np.savez(aside, **{field.name: getattr(self, field.name) for field in fields(self)})  # type: ignore[arg-type]
+        aside.rename(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote."""
+        with np.load(path) as stored:
+            return cls(**{name: stored[name] if stored[name].ndim else stored[name].item() for name in stored})
+
+    @classmethod
+    def load_all(cls, folder: Path, scenes: int) -> dict[int, Self]:
+        """What was done in the first so many scenes, by the scene's number."""
+        paths = {number: folder / f"{number:03d}.npz" for number in range(scenes)}
+        return {number: cls.load(path) for number, path in paths.items() if path.exists()}
+
+
 @dataclass(frozen=True)
-class Trials:
+class Trials(Kept):
     """What became of one variant's grasps in one scene, best first.
 
     grip: (n, 28) waypoints at the grip in the world frame. outcome: (n, 4) bool, columns FLAGS.
@@ -44,19 +67,6 @@ class Trials:
     def success(self) -> np.ndarray:
         """Which hold, (n,)."""
         return self.outcome[:, FLAGS.index("success")]
-
-    def save(self, path: Path) -> None:
-        """Write aside and rename, so that a file is there only when it is whole."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(f".{os.getpid()}_{path.name}")
-        np.savez(aside, **{field.name: getattr(self, field.name) for field in fields(self)})
-        aside.rename(path)
-
-    @classmethod
-    def load(cls, path: Path) -> "Trials":
-        """Read what `save` wrote."""
-        with np.load(path) as stored:
-            return cls(**{name: stored[name] if stored[name].ndim else stored[name].item() for name in stored})
 
 
 def compared(done: dict[str, dict[int, Trials]]) -> dict[str, dict[str, Any]]:

@@ -1,43 +1,18 @@
 """What benchmarks/refine.py keeps of each scene, and the figures that it makes of that."""
 
-import os
 import sys
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
-from generator_figures import FLAGS, Counts, change_of, mean, rate, resampled
+from generator_figures import FLAGS, Counts, Kept, change_of, mean, rate, resampled
 
 from dexzoo.grasp import Grasps
 from dexzoo.refinement import RANKINGS, Refinement, rank
 
 GENERATOR = "generator"
 """The rule that takes the generator's own first."""
-
-
-class Kept:
-    """Arrays that go to a file for each scene."""
-
-    def save(self, path: Path) -> None:
-        """Write aside and rename, so that a file is there only when it is whole."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(f".{os.getpid()}_{path.name}")
-        np.savez(aside, **{field.name: getattr(self, field.name) for field in fields(self)})  # type: ignore[arg-type]
-        aside.rename(path)
-
-    @classmethod
-    def load(cls, path: Path) -> Self:
-        """Read what `save` wrote."""
-        with np.load(path) as stored:
-            return cls(**{name: stored[name] if stored[name].ndim else stored[name].item() for name in stored})
-
-    @classmethod
-    def load_all(cls, folder: Path, scenes: int) -> dict[int, Self]:
-        """What was done in the first so many scenes, by the scene's number."""
-        paths = {number: folder / f"{number:03d}.npz" for number in range(scenes)}
-        return {number: cls.load(path) for number, path in paths.items() if path.exists()}
 
 
 @dataclass(frozen=True)
