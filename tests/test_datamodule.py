@@ -134,6 +134,8 @@ def test_wrong_data_is_named(folder: Path, em2: EM2, tmp_path: Path) -> None:
         GraspDataModule(predict_split="all")
     with pytest.raises(ValueError, match="batch_size is 0"):
         GraspDataModule(batch_size=0)
+    with pytest.raises(ValueError, match="train_share is 10, expected more than 0 and at most 1"):
+        GraspDataModule(train_share=10)
     with pytest.raises(ValueError, match="source 'drawn' is unknown; use some of generated, perturbed, refined"):
         GraspDataModule(sources=["generated", "drawn"])
     data = GraspDataModule(str(folder), cache=str(tmp_path))
@@ -158,6 +160,19 @@ def test_fewer_scenes(folder: Path, em2: EM2, tmp_path: Path) -> None:
     dataset = GraspDataModule(str(folder), num_scenes=2, cache=str(tmp_path)).dataset("train", em2)
     assert dataset.scene_index.unique().tolist() == [0, 1]
     assert len(dataset) == 80
+
+
+def test_a_share_of_the_training_scenes(folder: Path, em2: EM2, tmp_path: Path) -> None:
+    data = GraspDataModule(str(folder), train_share=0.3, cache=str(tmp_path))
+    whole = GraspDataModule(str(folder), cache=str(tmp_path))
+    assert data.dataset("train", em2).scene_index.unique().tolist() == [0, 1]  # 0.3 of four, rounded up
+    assert data.describe()["train_grasps"] == 80
+    for split in ("validation", "test"):
+        assert torch.equal(data.dataset(split, em2).grasps, whole.dataset(split, em2).grasps)
+    statistics = EM2(width=16)
+    data.fit_statistics(statistics)
+    expected = whole.waypoints[torch.from_numpy(whole.source.grasp_scene) < 2]
+    torch.testing.assert_close(statistics.grasp_vector.mean, statistics.grasp_vector.flatten(expected).mean(0))
 
 
 def test_what_is_trained_on_and_what_is_evaluated_are_chosen_by_source(folder: Path, em2: EM2, tmp_path: Path) -> None:

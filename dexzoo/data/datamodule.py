@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import os
 import sys
 from collections.abc import Iterator
@@ -138,6 +139,7 @@ class GraspDataModule(LightningDataModule):
     evaluation_sources: those that are validated, tested and predicted; what a user ranks is generated.
     predict_split: the split that `predict` runs over.
     num_scenes: use only the first so many scenes of each split, to try things out.
+    train_share: use only this share of the training scenes, the first ones; the other splits stay whole.
     cache: where encoded views are kept; by default the user's cache folder.
     seed: of the drawing.
 
@@ -154,6 +156,7 @@ class GraspDataModule(LightningDataModule):
         evaluation_sources: list[str] = SOURCES[:1],
         predict_split: str = "test",
         num_scenes: int | None = None,
+        train_share: float = 1.0,
         cache: str | None = None,
         seed: int = 0,
     ) -> None:
@@ -162,6 +165,8 @@ class GraspDataModule(LightningDataModule):
             raise ValueError(f"predict_split {predict_split!r} is unknown; use one of {', '.join(SPLITS)}")
         if batch_size < 1:
             raise ValueError(f"batch_size is {batch_size}, expected at least 1")
+        if not 0 < train_share <= 1:
+            raise ValueError(f"train_share is {train_share}, expected more than 0 and at most 1")
         for source in (*sources, *evaluation_sources):
             if source not in SOURCES:
                 raise ValueError(f"source {source!r} is unknown; use some of {', '.join(SOURCES)}")
@@ -169,7 +174,7 @@ class GraspDataModule(LightningDataModule):
         self.folder = folder if elsewhere else str(resource(folder))
         self.batch_size, self.predict_split, self.seed = batch_size, predict_split, seed
         self.sources, self.evaluation_sources = sources, evaluation_sources
-        self.num_scenes = num_scenes
+        self.num_scenes, self.train_share = num_scenes, train_share
         self.cache = Path(cache) if cache else user_cache()
 
     @cached_property
@@ -267,10 +272,11 @@ class GraspDataModule(LightningDataModule):
         if not len(rows):
             what = f"no {' or '.join(sources)} grasps in its {split} split"
             raise ValueError(f"grasp set {self.folder} has {what}; collect more objects")
-        if self.num_scenes is not None:
-            scene = self.source.grasp_scene[rows]
-            rows = rows[np.isin(scene, np.unique(scene)[: self.num_scenes])]
-        return torch.from_numpy(rows)
+        scene = self.source.grasp_scene[rows]
+        scenes = np.unique(scene)[: self.num_scenes]
+        if split == "train":
+            scenes = scenes[: math.ceil(self.train_share * len(scenes))]
+        return torch.from_numpy(rows[np.isin(scene, scenes)])
 
     def _encode(self, rows: list[int], model: GraspEvaluator) -> Scene:
         """The encoded views of some rows of the table of views, float16, from the cache where it has them."""
