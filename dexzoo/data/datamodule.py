@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 import os
 import sys
 from collections.abc import Iterator
@@ -275,7 +274,7 @@ class GraspDataModule(LightningDataModule):
         scene = self.source.grasp_scene[rows]
         scenes = np.unique(scene)[: self.num_scenes]
         if split == "train":
-            scenes = scenes[: math.ceil(self.train_share * len(scenes))]
+            scenes = scenes[: max(1, round(self.train_share * len(scenes)))]
         return torch.from_numpy(rows[np.isin(scene, scenes)])
 
     def _encode(self, rows: list[int], model: GraspEvaluator) -> Scene:

@@ -1,0 +1,196 @@
+"""What each ingredient, more data, width and recipe bring: runs of `dexzoo fit`, and their figures on the test objects.
+
+python benchmarks/ablation.py --list
+python benchmarks/ablation.py --runs em_fk em_fk-image --folder runs/ablation     # any of them, in any order, anywhere
+python benchmarks/ablation.py --done --out benchmarks/results/ablation.json       # sum up the runs that are finished
+Each run has a folder of its own: a finished run is not repeated, one that was killed goes on from its last checkpoint.
+All see as many grasps, `--grasps`, in batches of their configurations' size, whatever data they have; twenty times on
+the way the averaged weights are validated, and the best are kept. The test objects choose nothing. Intervals are 95 %
+bootstrap over scenes, also of the difference from the run that a row is compared with.
+"""
+
+import argparse
+import json
+import shutil
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+import dexzoo
+from dexzoo import training
+from dexzoo.comparison.figures import draw_scenes, figures
+from dexzoo.comparison.scores import Labels, first_image, measure, model_scores, read_labels
+from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.models.evaluator import GraspEvaluator
+from dexzoo.resources import resource
+
+NUM_VALIDATIONS = 20
+SOURCES = ("generated", "perturbed")
+Replicates = NDArray[np.float64]
+FIGURES = ("accuracy", "auroc", "scene_auroc", "average_precision", "calibration_error", "top1", "top5")
+ADAMW = {
+    "model.gain": 1.4142,
+    "model.optimizer": "adamw",
+    "model.learning_rate": 0.0003,
+    "model.weight_decay": 0.01,
+    "model.average_decay": 0.99,
+    "trainer.precision": "bf16-mixed",
+}
+"""How configs/em2-adamw.yaml differs from the thesis' recipe, for em1, which has no such file."""
+
+
+class Run(NamedTuple):
+    """config: its file. changes: what differs from it. against: the run that its figures are compared with."""
+
+    config: str
+    changes: dict[str, Any]
+    against: str | None = None
+
+
+def runs() -> dict[str, Run]:
+    """All runs by name: whole models, then NAME-WHAT without an ingredient, NAME@PERCENT on less data, and variants."""
+    whole = {"em_fk": ("em_fk.yaml", {}), "em2": ("em2-adamw.yaml", {}), "em1": ("em1.yaml", ADAMW)}
+    known = {name: Run(*made) for name, made in whole.items()}
+    for part in ("image", "depth", "cloud", "table", "attention"):
+        known[f"em_fk-{part}"] = Run("em_fk.yaml", {f"model.{part}": False}, "em_fk")
+    known["em_fk-perturbed"] = Run("em_fk.yaml", {"data.sources": ["generated"]}, "em_fk")
+    for share in (10, 30):
+        for name, (config, changes) in whole.items():
+            known[f"{name}@{share}"] = Run(config, changes | {"data.train_share": share / 100}, name)
+    known["em2-4096"] = Run("em2-adamw.yaml", {"model.width": 4096}, "em2")
+    known["em2-thesis"] = Run("em2.yaml", {}, "em2")
+    return known
+
+
+def main() -> None:
+    known = runs()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", nargs="+", metavar="NAME", default=list(known), help="default: all, in this order")
+    parser.add_argument("--done", action="store_true", help="run nothing more, sum up what the folder holds")
+    parser.add_argument("--list", action="store_true", help="name the runs, and which are finished")
+    parser.add_argument("--grasps", type=int, default=1_000_000, help="that each run sees in training")
+    parser.add_argument("--data", default="assets/grasps")
+    parser.add_argument("--folder", type=Path, default=Path("runs/ablation"))
+    parser.add_argument("--out", type=Path, help="file for the figures of all finished runs")
+    options = parser.parse_args()
+    if unknown := set(options.runs) - set(known):
+        parser.error(f"runs {', '.join(sorted(unknown))} are unknown; use some of {', '.join(known)}")
+    if options.list:
+        for name in known:
+            sys.stdout.write(f"{name:16} {'finished' if finished(options.folder / name) else ''}\n")
+        return
+    for name in [] if options.done else options.runs:
+        fit(options.folder / name, known[name], options.data, options.grasps)
+    if options.out:
+        result = measured(options.folder, known, options.data)
+        options.out.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
+
+
+def finished(folder: Path) -> bool:
+    """Whether fit has written the run's card, which comes last."""
+    return any(folder.glob("*.safetensors")) and any(folder.glob("*.json"))
+
+
+def asked(folder: Path) -> Path:
+    """The file with what was asked of a run, beside its folder."""
+    return folder.with_name(f"{folder.name}.yaml")
+
+
+def fit(folder: Path, run: Run, data: str, grasps: int) -> None:
+    """Do a run, or what is left of it. ValueError where the folder holds a run of another configuration."""
+    file, text = asked(folder), yaml.safe_dump(configuration(run, data, grasps), sort_keys=False)
+    if file.exists() and file.read_text() != text:
+        raise ValueError(f"{file} differs from what is asked for; go on with the same options or give another --folder")
+    if finished(folder):
+        return
+    last = folder / "checkpoints" / "last.ckpt"
+    resumed = ["--ckpt_path", str(last)] if last.exists() else []
+    if not resumed:
+        shutil.rmtree(folder, ignore_errors=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    place = {"save_dir": folder.parent, "name": "", "version": folder.name}
+    logger = [f"--trainer.logger.init_args.{name}={value}" for name, value in place.items()]
+    training.main(["fit", "--config", str(file), *logger, *resumed])
+
+
+def configuration(run: Run, data: str, grasps: int) -> dict[str, Any]:
+    """The shipped configuration with the run's changes, its length counted in grasps, not stopped early."""
+    config: dict[str, Any] = yaml.safe_load((resource("configs") / run.config).read_text())
+    for key, value in run.changes.items():
+        part, name = key.split(".")
+        (config["model"]["init_args"] if part == "model" else config[part])[name] = value
+    config["data"]["folder"] = data
+    steps = max(1, grasps // config["data"]["batch_size"])
+    interval = max(1, steps // NUM_VALIDATIONS)
+    trainer = config["trainer"]
+    trainer |= {"max_epochs": -1, "max_steps": steps, "val_check_interval": interval, "check_val_every_n_epoch": None}
+    trainer["callbacks"] = [one for one in trainer["callbacks"] if "EarlyStopping" not in one["class_path"]]
+    for one in trainer["callbacks"]:
+        if one["init_args"]["filename"] == "last":
+            one["init_args"]["every_n_train_steps"] = interval
+    return config
+
+
+def measured(folder: Path, known: dict[str, Run], address: str) -> dict[str, Any]:
+    """The figures of all finished runs on the test objects. ValueError for a run that saw another grasp set."""
+    data = GraspDataModule(address)
+    labels = {source: found for source in SOURCES if (found := read_labels(data, "test", source))}
+    replicates: dict[str, dict[str, Replicates]] = {}
+    rows: dict[str, Any] = {}
+    for name in [name for name in known if finished(folder / name)]:
+        model = dexzoo.load(folder / name)
+        rows[name] = described(folder / name, model, data)
+        replicates[name] = {source: replicated(model, data, truth, source) for source, truth in labels.items()}
+        rows[name]["figures"] = {source: with_intervals(found) for source, found in replicates[name].items()}
+    for name, row in rows.items():
+        against = known[name].against
+        if against in rows:
+            differences = {
+                source: {key: found[key] - replicates[against][source][key] for key in FIGURES}
+                for source, found in replicates[name].items()
+            }
+            row |= {"against": against, "change": {key: with_intervals(one) for key, one in differences.items()}}
+    sizes = {source: {"grasps": len(one.success), "scenes": one.num_scenes} for source, one in labels.items()}
+    return {"data": data.source.sha256, "test": sizes, "runs": rows}
+
+
+def described(folder: Path, model: GraspEvaluator, data: GraspDataModule) -> dict[str, Any]:
+    """What a run was and what its model takes."""
+    card = json.loads(next(folder.glob("*.json")).read_text())
+    if card["data"]["sha256"] != data.source.sha256:
+        raise ValueError(f"{folder} was trained on another grasp set than {data.folder}; run it anew")
+    config = yaml.safe_load(asked(folder).read_text())
+    image, shown = first_image(data, "test"), data.dataset("test", model, [SOURCES[0]]).grasps
+    return {
+        "grasps_seen": config["trainer"]["max_steps"] * config["data"]["batch_size"],
+        "train_grasps": card["data"]["train_grasps"],
+        "validation_auroc": card["metrics"]["validation_auroc"],
+        "cost": asdict(measure(model, image, shown)),
+    }
+
+
+def replicated(model: GraspEvaluator, data: GraspDataModule, labels: Labels, source: str) -> dict[str, Replicates]:
+    """Each figure (1 + draw,), first of the scenes as they are, then of each draw of scenes."""
+    scores = model_scores(model, data.dataset("test", model, [source]), f"{model.architecture} on {source} grasps")
+    weights = np.concatenate((np.ones((1, labels.num_scenes)), draw_scenes(labels.num_scenes, seed=0)))
+    found = figures(labels, scores, weights)
+    return {key: found[key] for key in FIGURES}
+
+
+def with_intervals(found: dict[str, Replicates]) -> dict[str, Any]:
+    """Value and 95 % interval of each figure."""
+    out = {}
+    for key, (value, *draws) in found.items():
+        interval = np.percentile([draw for draw in draws if np.isfinite(draw)], [2.5, 97.5])
+        out[key] = {"value": round(float(value), 6), "interval": [round(float(end), 6) for end in interval]}
+    return out
+
+
+if __name__ == "__main__":
+    main()

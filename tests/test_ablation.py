@@ -1,0 +1,103 @@
+"""The benchmark of ingredients, data, width and recipe: runs resume, are not repeated, and are measured alike."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic
+import torch
+
+from dexzoo.comparison import scores
+from dexzoo.comparison.compare import compare
+from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.models.em2 import EM2
+from dexzoo.models.zoo import load
+from dexzoo.resources import resource
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+
+@pytest.fixture
+def ablation(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):  # noqa: ANN201, a module
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(scores, "NUM_TIMED", 3)
+    import ablation
+
+    yield ablation
+    sys.modules.pop("ablation")
+
+
+def test_every_run_names_arguments_that_there_are(ablation: Any) -> None:  # noqa: ANN401
+    for name, run in ablation.runs().items():
+        shipped = ablation.configuration(ablation.Run(run.config, {}), "somewhere", 64_000)
+        made = ablation.configuration(run, "somewhere", 64_000)
+        assert (resource("configs") / run.config).is_file()
+        assert (made == shipped) == (not run.changes), name
+        for key in run.changes:
+            part, argument = key.split(".")
+            if part == "model":
+                assert argument in shipped["model"]["init_args"], name
+        assert made["trainer"]["max_steps"] * made["data"]["batch_size"] == 64_000
+        assert run.against is None or run.against in ablation.runs()
+
+
+def test_runs_go_on_are_not_repeated_and_are_measured_as_compare_does(
+    ablation: Any,  # noqa: ANN401
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    grasps = str(synthetic.write(tmp_path / "grasps"))
+    known = {
+        "whole": ablation.Run("em2_lite.yaml", {"model.width": 16}),
+        "half": ablation.Run("em2_lite.yaml", {"model.width": 16, "data.train_share": 0.5}, "whole"),
+    }
+    folder = tmp_path / "runs"
+    step = EM2.training_step
+
+    def killed(self: EM2, batch: object, batch_idx: int) -> torch.Tensor:
+        if self.trainer.global_step == 2:
+            raise RuntimeError("killed")
+        return step(self, batch, batch_idx)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(EM2, "training_step", killed)
+        with pytest.raises(RuntimeError, match="killed"):
+            ablation.fit(folder / "half", known["half"], grasps, 4 * 64)
+    assert not ablation.finished(folder / "half")
+    for name, run in known.items():
+        ablation.fit(folder / name, run, grasps, 4 * 64)
+        assert torch.load(folder / name / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 4
+    ablation.fit(tmp_path / "unbroken" / "half", known["half"], grasps, 4 * 64)
+    ends = [load(place / "half").state_dict() for place in (folder, tmp_path / "unbroken")]
+    assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ablation.training, "main", lambda _: pytest.fail("repeated"))
+        ablation.fit(folder / "half", known["half"], grasps, 4 * 64)
+        with pytest.raises(ValueError, match=r"half\.yaml differs from what is asked for"):
+            ablation.fit(folder / "half", known["half"], grasps, 5 * 64)
+
+    result = ablation.measured(folder, known, grasps)
+    assert [row["train_grasps"] for row in result["runs"].values()] == [160, 80]
+    data = GraspDataModule(grasps)
+    reference = compare({name: load(folder / name) for name in known}, data)["sources"]["generated"]["rows"]
+    for name, row in result["runs"].items():
+        assert row["grasps_seen"] == 256
+        for key, figure in row["figures"]["generated"].items():
+            assert figure == reference[name]["figures"][key]
+    moved = result["runs"]["half"]["change"]["generated"]["auroc"]["value"]
+    values = [row["figures"]["generated"]["auroc"]["value"] for row in result["runs"].values()]
+    assert moved == pytest.approx(values[1] - values[0], abs=2e-6)
+    assert np.ptp(result["runs"]["half"]["change"]["generated"]["auroc"]["interval"]) == 0  # of one scene
+
+
+def test_a_run_on_other_data_is_refused(ablation: Any, tmp_path: Path) -> None:  # noqa: ANN401
+    grasps, others = synthetic.write(tmp_path / "grasps"), synthetic.write(tmp_path / "others", seed=1)
+    known = {"one": ablation.Run("em2_lite.yaml", {"model.width": 8})}
+    ablation.fit(tmp_path / "runs" / "one", known["one"], str(grasps), 64)
+    with pytest.raises(ValueError, match="was trained on another grasp set"):
+        ablation.measured(tmp_path / "runs", known, os.fspath(others))
