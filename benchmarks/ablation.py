@@ -53,7 +53,7 @@ class Run(NamedTuple):
 
 
 def runs() -> dict[str, Run]:
-    """All runs by name: whole models, then NAME-WHAT without an ingredient, NAME@PERCENT on less data, and variants."""
+    """All runs by name: whole models, then NAME-WHAT without an ingredient, NAME@PERCENT on less data, NAME+VARIANT."""
     whole = {"em_fk": ("em_fk.yaml", {}), "em2": ("em2-adamw.yaml", {}), "em1": ("em1.yaml", ADAMW)}
     known = {name: Run(*made) for name, made in whole.items()}
     for part in ("image", "depth", "cloud", "table", "attention"):
@@ -62,8 +62,8 @@ def runs() -> dict[str, Run]:
     for share in (10, 30):
         for name, (config, changes) in whole.items():
             known[f"{name}@{share}"] = Run(config, changes | {"data.train_share": share / 100}, name)
-    known["em2-4096"] = Run("em2-adamw.yaml", {"model.width": 4096}, "em2")
-    known["em2-thesis"] = Run("em2.yaml", {}, "em2")
+    known["em2+4096"] = Run("em2-adamw.yaml", {"model.width": 4096}, "em2")
+    known["em2+thesis"] = Run("em2.yaml", {}, "em2")
     return known
 
 

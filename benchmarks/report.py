@@ -5,12 +5,10 @@ python benchmarks/report.py
 
 from typing import Any
 
+from evaluator_report import evaluators, first_meshes
 from generator_report import generator, points, rate
 from refine_report import refinement
 from tables import RESULTS, ROOT, percent, read, span, table, with_figures
-
-from dexzoo.comparison.report import NOTES, cost_table, counts_table, main_table, title
-from dexzoo.comparison.report import table as markdown_table
 
 
 def main() -> None:
@@ -236,21 +234,6 @@ def labels(found: dict[str, Any]) -> str:
     )
 
 
-def evaluators(found: dict[str, Any]) -> str:
-    """The comparison's own tables, and its charts."""
-    parts = ["## Evaluators\n", f"`benchmarks/comparison.py`. {NOTES}"]
-    for source, section in found["sources"].items():
-        parts += [f"{title(source, section)}:\n", markdown_table(main_table(section))]
-        parts += [markdown_table(counts_table(section))] if source == "generated" else []
-    parts += [
-        markdown_table(cost_table(found["cost"])),
-        "![Success by place in the ranking](comparison/rank.png)\n",
-        "![Calibration](comparison/reliability.png)\n",
-        "![Success of the first grasp by category](comparison/categories.png)\n",
-    ]
-    return "\n".join(parts)
-
-
 def first_refinement() -> str:
     """What refinement did before it was rebuilt, until the benchmark has been run anew."""
     if (RESULTS / "refinement.json").exists():
@@ -290,12 +273,11 @@ def first_refinement() -> str:
 
 
 def page() -> str:
-    meshes = read("meshes")
     kinematics, collect = read("kinematics"), read("collect")
     parts = [
         "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
         "bootstrap over scenes.\n",
-        evaluators(read("comparison")),
+        evaluators(),
         first_refinement(),
         "## Labels\n\n" + labels(read("simulator")),
         f"## The hand\n\n`benchmarks/kinematics.py`, {kinematics['threads']} threads; all links of "
@@ -341,25 +323,7 @@ def page() -> str:
         "batches of "
         + ", ".join(f"{size}: {value:,.0f}" for size, value in collect["grasps_loaded_per_second"].items())
         + ".\n",
-        f"## Meshes from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no part of "
-        "dexzoo, 50 grasps each from one view, 0.2 kg, friction 0.7. At least one grasp holds for "
-        f"{meshes['objects_with_a_grasp_that_holds']} of {len(meshes['objects'])}.\n",
-        table(
-            ("object", "grasps", "hold", "hit the table", "first that holds in em2's order", "in the generator's"),
-            [
-                (
-                    row["object"],
-                    row["grasps"],
-                    row["hold"],
-                    row["collided"],
-                    row["first_that_holds_by_evaluator"] or "none",
-                    row["first_that_holds_by_generator"] or "none",
-                )
-                if "grasps" in row
-                else (row["object"], row["error"], "", "", "", "")
-                for row in meshes["objects"]
-            ],
-        ),
+        first_meshes(),
     ]
     return "\n".join(parts)
 

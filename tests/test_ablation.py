@@ -1,6 +1,7 @@
 """The benchmark of ingredients, data, width and recipe: runs resume, are not repeated, and are measured alike."""
 
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,8 @@ def ablation(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):  # noqa: ANN201, 
     import ablation
 
     yield ablation
-    sys.modules.pop("ablation")
+    for name in ("ablation", "evaluator_report", "tables"):
+        sys.modules.pop(name, None)
 
 
 def test_every_run_names_arguments_that_there_are(ablation: Any) -> None:  # noqa: ANN401
@@ -52,8 +54,8 @@ def test_runs_go_on_are_not_repeated_and_are_measured_as_compare_does(
 ) -> None:
     grasps = str(synthetic.write(tmp_path / "grasps"))
     known = {
-        "whole": ablation.Run("em2_lite.yaml", {"model.width": 16}),
-        "half": ablation.Run("em2_lite.yaml", {"model.width": 16, "data.train_share": 0.5}, "whole"),
+        "em2": ablation.Run("em2_lite.yaml", {"model.width": 16}),
+        "em2@50": ablation.Run("em2_lite.yaml", {"model.width": 16, "data.train_share": 0.5}, "em2"),
     }
     folder = tmp_path / "runs"
     step = EM2.training_step
@@ -66,20 +68,20 @@ def test_runs_go_on_are_not_repeated_and_are_measured_as_compare_does(
     with monkeypatch.context() as patch:
         patch.setattr(EM2, "training_step", killed)
         with pytest.raises(RuntimeError, match="killed"):
-            ablation.fit(folder / "half", known["half"], grasps, 4 * 64)
-    assert not ablation.finished(folder / "half")
+            ablation.fit(folder / "em2@50", known["em2@50"], grasps, 4 * 64)
+    assert not ablation.finished(folder / "em2@50")
     for name, run in known.items():
         ablation.fit(folder / name, run, grasps, 4 * 64)
         assert torch.load(folder / name / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 4
-    ablation.fit(tmp_path / "unbroken" / "half", known["half"], grasps, 4 * 64)
-    ends = [load(place / "half").state_dict() for place in (folder, tmp_path / "unbroken")]
+    ablation.fit(tmp_path / "unbroken" / "em2@50", known["em2@50"], grasps, 4 * 64)
+    ends = [load(place / "em2@50").state_dict() for place in (folder, tmp_path / "unbroken")]
     assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
 
     with monkeypatch.context() as patch:
         patch.setattr(ablation.training, "main", lambda _: pytest.fail("repeated"))
-        ablation.fit(folder / "half", known["half"], grasps, 4 * 64)
-        with pytest.raises(ValueError, match=r"half\.yaml differs from what is asked for"):
-            ablation.fit(folder / "half", known["half"], grasps, 5 * 64)
+        ablation.fit(folder / "em2@50", known["em2@50"], grasps, 4 * 64)
+        with pytest.raises(ValueError, match=r"em2@50\.yaml differs from what is asked for"):
+            ablation.fit(folder / "em2@50", known["em2@50"], grasps, 5 * 64)
 
     result = ablation.measured(folder, known, grasps)
     assert [row["train_grasps"] for row in result["runs"].values()] == [160, 80]
@@ -89,10 +91,17 @@ def test_runs_go_on_are_not_repeated_and_are_measured_as_compare_does(
         assert row["grasps_seen"] == 256
         for key, figure in row["figures"]["generated"].items():
             assert figure == reference[name]["figures"][key]
-    moved = result["runs"]["half"]["change"]["generated"]["auroc"]["value"]
+    moved = result["runs"]["em2@50"]["change"]["generated"]["auroc"]["value"]
     values = [row["figures"]["generated"]["auroc"]["value"] for row in result["runs"].values()]
     assert moved == pytest.approx(values[1] - values[0], abs=2e-6)
-    assert np.ptp(result["runs"]["half"]["change"]["generated"]["auroc"]["interval"]) == 0  # of one scene
+    assert np.ptp(result["runs"]["em2@50"]["change"]["generated"]["auroc"]["interval"]) == 0  # of one scene
+
+    from evaluator_report import ablation as written
+
+    text = written(result)
+    assert "each run sees 256 grasps in training" in text
+    assert re.findall(r"^\| (em2\S*) \| (\d+) \|", text, re.M) == [("em2", "160"), ("em2@50", "80")]
+    assert f"| {moved:+.3f} (" in text
 
 
 def test_a_run_on_other_data_is_refused(ablation: Any, tmp_path: Path) -> None:  # noqa: ANN401

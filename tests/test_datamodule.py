@@ -134,7 +134,7 @@ def test_wrong_data_is_named(folder: Path, em2: EM2, tmp_path: Path) -> None:
         GraspDataModule(predict_split="all")
     with pytest.raises(ValueError, match="batch_size is 0"):
         GraspDataModule(batch_size=0)
-    with pytest.raises(ValueError, match="train_share is 10.0, expected more than 0 and at most 1"):
+    with pytest.raises(ValueError, match=r"train_share is 10\.0, expected more than 0 and at most 1"):
         GraspDataModule(train_share=10.0)
     with pytest.raises(ValueError, match="source 'drawn' is unknown; use some of generated, perturbed, refined"):
         GraspDataModule(sources=["generated", "drawn"])

@@ -1,0 +1,164 @@
+"""What benchmarks/report.py writes of the evaluators, from the JSON of several benchmarks."""
+
+from typing import Any
+
+from tables import RESULTS, read, span, table
+
+from dexzoo.comparison.report import NOTES, cost_table, counts_table, main_table, title
+from dexzoo.comparison.report import table as markdown_table
+
+GENERATED = "generated"
+WITHOUT, LESS_DATA, VARIANT = "-", "@", "+"
+"""In the name of a run of benchmarks/ablation.py: without an ingredient, on so many percent of the data, otherwise."""
+
+
+def evaluators() -> str:
+    """All that has been measured of the evaluators; each part as soon as its benchmark has been run."""
+    parts = {"comparison": comparison, "evaluators_meshes": meshes, "ablation": ablation, "training": training}
+    return "\n".join(write(read(name)) for name, write in parts.items() if (RESULTS / f"{name}.json").exists())
+
+
+def comparison(found: dict[str, Any]) -> str:
+    """The comparison's own tables, and its charts."""
+    parts = ["## Evaluators\n", f"`benchmarks/comparison.py`. {NOTES}"]
+    for source, section in found["sources"].items():
+        parts += [f"{title(source, section)}:\n", markdown_table(main_table(section))]
+        parts += [markdown_table(counts_table(section))] if source == "generated" else []
+    parts += [
+        markdown_table(cost_table(found["cost"])),
+        "![Success by place in the ranking](comparison/rank.png)\n",
+        "![Calibration](comparison/reliability.png)\n",
+        "![Success of the first grasp by category](comparison/categories.png)\n",
+    ]
+    return "\n".join(parts)
+
+
+def meshes(found: dict[str, Any]) -> str:
+    """The comparison on objects that are no part of dexzoo, and what became of each object's grasps."""
+    section, objects = found["sources"][GENERATED], found["objects"]
+    rows = section["rows"]
+    scenes, tried = (sum(one[key] for one in objects.values()) for key in ("with_one_that_holds", "scenes"))
+    without = "; ".join(f"{name} ({', '.join(why)})" for name, why in found["objects_without_grasps"].items())
+    return "\n".join(
+        [
+            "### On objects from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no "
+            "part of dexzoo, 0.2 kg, friction 0.7, the default generator's grasps on one view of each scene. At least "
+            f"one grasp holds in {scenes} of {tried} scenes, which bounds every top-1; there is no validation to choose a "
+            f"threshold for gm on. Objects without any grasp: {without or 'none'}. {title(GENERATED, section)}:\n",
+            markdown_table(main_table(section)),
+            table(
+                ("object", "scenes", "grasps", "hold", "hit the table", *(f"first of {name} holds" for name in rows)),
+                [
+                    (
+                        name,
+                        one["scenes"],
+                        one["grasps"],
+                        one["hold"],
+                        one["collided"],
+                        *(first(row["by_category"].get(name)) for row in rows.values()),
+                    )
+                    for name, one in objects.items()
+                ],
+            ),
+        ]
+    )
+
+
+def first(of_object: dict[str, Any] | None) -> str:
+    return f"{of_object['top1'] * of_object['scenes']:.0f} of {of_object['scenes']}" if of_object else ""
+
+
+def ablation(found: dict[str, Any]) -> str:
+    """Ingredients, the learning curve, and the variants of EM2."""
+    runs = found["runs"]
+    texts = {
+        WITHOUT: "What each ingredient brings; a minus stands for without:",
+        LESS_DATA: "With 10, 30 and 100 % of the training scenes:",
+        VARIANT: "Width and recipe of EM2:",
+    }
+    sizes = ", ".join(f"{size['grasps']:,} {source}" for source, size in found["test"].items())
+    seen = " or ".join(f"{count:,}" for count in sorted({row["grasps_seen"] for row in runs.values()}))
+    parts = [
+        f"### Ingredients, data, width and recipe\n\n`benchmarks/ablation.py`; each run sees {seen} grasps in "
+        f"training, the weights are the best on validation; test objects, {sizes} grasps. Changes are from the run that "
+        "stands first of its kind, with their intervals over the same draws of scenes.\n"
+    ]
+    for mark, text in texts.items():
+        changed = sorted(name for name in runs if mark in name)
+        wholes = dict.fromkeys(name.split(mark)[0] for name in changed)
+        names = [name for whole in wholes for name in (whole, *changed) if name.split(mark)[0] == whole]
+        if names:
+            parts += [text + "\n", runs_table({name: runs[name] for name in names if name in runs})]
+    return "\n".join(parts)
+
+
+def runs_table(runs: dict[str, Any]) -> str:
+    head = ("run", "training grasps", "accuracy", "AUROC", "change", "top-1", "change", "AUROC on perturbed", "change")
+    return table(
+        head,
+        [
+            (
+                name,
+                f"{row['train_grasps']:,}",
+                figure(row, "figures", GENERATED, "accuracy", 100, 1),
+                *(figure(row, key, GENERATED, "auroc", 1, 3) for key in ("figures", "change")),
+                *(figure(row, key, GENERATED, "top1", 100, 1) for key in ("figures", "change")),
+                *(figure(row, key, "perturbed", "auroc", 1, 3) for key in ("figures", "change")),
+            )
+            for name, row in runs.items()
+        ],
+    )
+
+
+def figure(row: dict[str, Any], key: str, source: str, name: str, scale: float, digits: int) -> str:
+    """A figure with its interval; a change with its sign."""
+    found = row.get(key, {}).get(source)
+    if found is None:
+        return ""
+    value, sign = scale * found[name]["value"], "+" if key == "change" else ""
+    return f"{value:{sign}.{digits}f} ({span(found[name]['interval'], scale, digits)})"
+
+
+def training(found: dict[str, Any]) -> str:
+    """What encoding a view once is worth."""
+    learning, scoring = found["training"], found["scoring"]
+    rows = [
+        ("training" if part is learning else "scoring", name, f"{value:.1f}")
+        for part in (learning, scoring)
+        for name, value in part["seconds_for_1000_grasps"].items()
+    ]
+    return (
+        f"### A view encoded once\n\n`benchmarks/training.py`; EM2, {found['threads']} thread(s). Training with kept "
+        f"features is {learning['ratio']:.0f} times faster than with the trunk in the loop, and "
+        f"{learning['ratio_in_the_first_epoch']:.0f} times in the first epoch, which encodes all views; scoring "
+        f"grasps on one view is {scoring['ratio']:.0f} times faster than pair by pair.\n\n"
+    ) + table(("", "1,000 grasps with", "processor seconds"), rows)
+
+
+def first_meshes() -> str:
+    """One ranking of grasps on objects from elsewhere, until the comparison has been run on them."""
+    if (RESULTS / "evaluators_meshes.json").exists():
+        return ""
+    meshes = read("meshes")
+    parts = [
+        f"## Meshes from elsewhere\n\nScanned and CAD household objects that are no part of "
+        "dexzoo, 50 grasps each from one view, 0.2 kg, friction 0.7. At least one grasp holds for "
+        f"{meshes['objects_with_a_grasp_that_holds']} of {len(meshes['objects'])}.\n",
+        table(
+            ("object", "grasps", "hold", "hit the table", "first that holds in em2's order", "in the generator's"),
+            [
+                (
+                    row["object"],
+                    row["grasps"],
+                    row["hold"],
+                    row["collided"],
+                    row["first_that_holds_by_evaluator"] or "none",
+                    row["first_that_holds_by_generator"] or "none",
+                )
+                if "grasps" in row
+                else (row["object"], row["error"], "", "", "", "")
+                for row in meshes["objects"]
+            ],
+        ),
+    ]
+    return "\n".join(parts)

@@ -1,0 +1,112 @@
+"""What encoding a view once is worth, in training and in scoring: ratios of times taken in one run.
+
+python benchmarks/training.py --out benchmarks/results/training.json
+EM2 takes a few steps of training with the trunk's features kept, and with each grasp's view going through the trunk in
+every step; the first epoch also encodes all views of the set. Then grasps on one view are scored at once, and one by
+one, each with the view encoded anew. Times are of the processor, so that other programs do not count; OMP_NUM_THREADS
+bounds the threads.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+import dexzoo
+from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.models.em2 import EM2
+from dexzoo.models.evaluator import CHUNK, Batch
+
+KEPT_STEPS, TRUNK_STEPS = 16, 2
+NUM_VIEWS = 16
+NUM_GRASPS, NUM_PAIRS = 1000, 24
+NUM_SCENES = 4
+"""Of training; how many there are is nothing to the time of a step."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", default="assets/grasps")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    data = GraspDataModule(options.data, num_scenes=NUM_SCENES)
+    result = {"threads": torch.get_num_threads(), "training": training(data), "scoring": scoring(data)}
+    text = json.dumps(result, indent=2)
+    if options.out:
+        options.out.write_text(text + "\n")
+    sys.stdout.write(text + "\n")
+
+
+class TrunkInTheLoop(EM2):
+    """EM2 whose views stay images."""
+
+    frozen_encoder = False
+
+
+def training(data: GraspDataModule) -> dict[str, Any]:
+    """Processor seconds for 1,000 grasps of training with features kept and with the trunk in the loop."""
+    torch.manual_seed(0)
+    model = EM2(gain=1.4142, optimizer="adamw", learning_rate=0.0003, weight_decay=0.01)
+    data.fit_statistics(model)
+    optimizer = model.configure_optimizers()
+    features, images = data.dataset("train", model), data.dataset("train", TrunkInTheLoop())
+    batches = list(data.loader(features, balanced=True).sampler)
+
+    def step(batch: Batch) -> None:
+        with torch.autocast("cpu", torch.bfloat16):
+            loss = F.binary_cross_entropy_with_logits(model.batch_logit(batch), batch.success)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    def with_trunk(rows: list[int]) -> None:
+        batch = images[rows]
+        step(batch._replace(views=model.encode(batch.views[batch.view]), view=torch.arange(len(rows))))
+
+    kept = seconds(lambda rows: step(features[rows]), batches[:KEPT_STEPS]) / (KEPT_STEPS * data.batch_size)
+    trunk = seconds(with_trunk, batches[:TRUNK_STEPS]) / (TRUNK_STEPS * data.batch_size)
+    view = seconds(lambda row: model.encode(images[row].views), [[row] for row in range(NUM_VIEWS)]) / NUM_VIEWS
+    encoding = view * data.source.views.num_rows / data.source.grasps.num_rows  # its part in a grasp of the first epoch
+    return {
+        "batch_size": data.batch_size,
+        "seconds_for_1000_grasps": {"features kept": 1000 * kept, "trunk in the loop": 1000 * trunk},
+        "ratio": trunk / kept,
+        "ratio_in_the_first_epoch": trunk / (kept + encoding),
+    }
+
+
+def scoring(data: GraspDataModule) -> dict[str, Any]:
+    """Processor seconds for 1,000 grasps on one view, at once and pair by pair."""
+    model = dexzoo.load("em2")
+    image = data.source.images([0])[torch.tensor([0])]
+    grasps = data.waypoints[torch.arange(NUM_GRASPS) % len(data.waypoints)]
+
+    @torch.no_grad()
+    def score(part: Tensor) -> None:
+        scene = model.encode(image)
+        for some in part.split(CHUNK):
+            model.logit(scene, some[None])
+
+    once = seconds(score, [grasps])
+    pairs = NUM_GRASPS / NUM_PAIRS * seconds(score, list(grasps[:NUM_PAIRS].split(1)))
+    return {"seconds_for_1000_grasps": {"view encoded once": once, "pair by pair": pairs}, "ratio": pairs / once}
+
+
+def seconds(work: Callable[[Any], object], parts: list[Any]) -> float:
+    """Processor seconds of the work on all parts, after it was done once on the first."""
+    work(parts[0])
+    start = time.process_time()
+    for part in parts:
+        work(part)
+    return time.process_time() - start
+
+
+if __name__ == "__main__":
+    main()
