@@ -43,8 +43,8 @@ def meshes(found: dict[str, Any]) -> str:
         [
             "### On objects from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no "
             "part of dexzoo, 0.2 kg, friction 0.7, the default generator's grasps on one view of each scene. At least "
-            f"one grasp holds in {scenes} of {tried} scenes, which bounds every top-1; there is no validation to choose a "
-            f"threshold for gm on. Objects without any grasp: {without or 'none'}. {title(GENERATED, section)}:\n",
+            f"one grasp holds in {scenes} of {tried} scenes, which bounds every top-1; there is no validation to choose "
+            f"a threshold for gm on. Objects without any grasp: {without or 'none'}. {title(GENERATED, section)}:\n",
             markdown_table(main_table(section)),
             table(
                 ("object", "scenes", "grasps", "hold", "hit the table", *(f"first of {name} holds" for name in rows)),
@@ -80,8 +80,8 @@ def ablation(found: dict[str, Any]) -> str:
     seen = " or ".join(f"{count:,}" for count in sorted({row["grasps_seen"] for row in runs.values()}))
     parts = [
         f"### Ingredients, data, width and recipe\n\n`benchmarks/ablation.py`; each run sees {seen} grasps in "
-        f"training, the weights are the best on validation; test objects, {sizes} grasps. Changes are from the run that "
-        "stands first of its kind, with their intervals over the same draws of scenes.\n"
+        f"training, the weights are the best on validation; test objects, {sizes} grasps. Changes are from the run "
+        "that stands first of its kind, with their intervals over the same draws of scenes.\n"
     ]
     for mark, text in texts.items():
         changed = sorted(name for name in runs if mark in name)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from jsonargparse import ArgumentError
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -28,6 +29,7 @@ from dexzoo.resources import resource
 
 SUBCOMMANDS = ("fit", "validate", "test", "predict")
 CONFIG_OPTIONS = ("-c", "--config")
+DATA_SETTINGS = ("batch_size", "sources", "num_scenes", "train_share", "seed")
 NOT_NEWS = (
     ".*does not have many workers.*",  # batches are gathers from memory, workers would slow them
     ".*args parameter is intended to run from within Python.*",  # Lightning sees ours and those of `python -m dexzoo`
@@ -95,6 +97,7 @@ class CommandLine(LightningCLI):
         card = {
             "data": self.datamodule.describe(),
             "metrics": {name: round(value, 4) for name, value in metrics.items()},
+            "config": self._settings(),
             "seed": self._get(self.config, "seed_everything"),
             "command": self.command,
         }
@@ -140,6 +143,13 @@ class CommandLine(LightningCLI):
         rows = torch.arange(len(dataset)).split(self.datamodule.batch_size)  # all of them in each process
         logit = torch.cat([model.batch_logit(dataset[part.tolist()]) for part in rows])
         model.calibrate(logit, dataset.success)
+
+    def _settings(self) -> dict[str, Any]:
+        """What a card says of the run, besides the model's arguments: how data were drawn and the trainer was set."""
+        asked = yaml.safe_load(self._parser("fit").dump(self.config["fit"], skip_default=True))
+        trainer = {name: value for name, value in asked["trainer"].items() if name not in ("logger", "callbacks")}
+        data = {name: getattr(self.datamodule, name) for name in DATA_SETTINGS}
+        return {"data": data, "trainer": trainer}
 
     def _report(self, results: dict[str, Any]) -> None:
         if self._get(self.config, "json"):

@@ -65,6 +65,24 @@ def test_the_demo_ranks_verifies_and_draws(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"grasp.png", "lift.png"}
 
 
+def test_your_architecture_is_trained_saved_and_scores(tmp_path: Path) -> None:
+    path = ROOT / "examples" / "02_your_architecture.py"
+    assert len(path.read_text().splitlines()) < 60
+    call = [sys.executable, str(path), "--out", str(tmp_path)]
+    done = subprocess.run(call, capture_output=True, text=True, check=True, timeout=120, cwd=ROOT)
+    scores = json.loads(done.stdout.strip().splitlines()[-1].partition(": ")[2])
+    assert len(scores) == 20
+    assert len(set(scores)) > 5
+    assert json.loads((tmp_path / "two_branches.json").read_text())["data"]["train_grasps"] > 0
+
+
+def test_the_cards_say_what_the_weights_and_the_benchmarks_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    cards = runpy.run_path(str(ROOT / "benchmarks" / "cards.py"))
+    written = {path.stem: path.read_text() for path in (ROOT / "docs" / "cards").glob("*.md")}
+    assert written == {name: cards["page"](name) for name in cards["shipped"]()}
+
+
 def test_the_figures_are_those_that_the_benchmarks_wrote(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     report = runpy.run_path(str(ROOT / "benchmarks" / "report.py"))

@@ -1,6 +1,7 @@
 import itertools
 import json
 import pickle
+import runpy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -50,7 +51,17 @@ def resnet_trunk() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module", params=zoo.list_models())
+def example() -> type[GraspEvaluator]:
+    """The architecture of examples/, which is no part of the zoo and keeps the same contract."""
+    path = Path(__file__).parent.parent / "examples" / "02_your_architecture.py"
+    cls: type[GraspEvaluator] = runpy.run_path(str(path), run_name="example")["TwoBranches"]
+    return cls
+
+
+YOURS = example()
+
+
+@pytest.fixture(scope="module", params=[*zoo.list_models(), YOURS.architecture])
 def model(request: pytest.FixtureRequest, data: GraspDataModule) -> GraspEvaluator:
     torch.manual_seed(0)
     made = zoo.model_class(request.param)()
@@ -189,6 +200,15 @@ def test_a_half_turn_of_sign_in_a_quaternion_changes_nothing(model: GraspEvaluat
     torch.testing.assert_close(model.logit(scene, flipped), model.logit(scene, waypoints))
 
 
+def test_your_own_architecture_needs_no_more_than_a_subclass(tmp_path: Path) -> None:
+    assert YOURS.architecture not in zoo.list_models()
+    path = YOURS(width=8).save(tmp_path)
+    assert isinstance(zoo.load(path), YOURS)
+    change_card(path, architecture="three_branches")
+    with pytest.raises(ValueError, match="model 'three_branches' is unknown.*import your own first"):
+        zoo.load(path)
+
+
 # the thesis' architectures
 
 
@@ -271,6 +291,9 @@ def test_fit_writes_a_run_that_load_and_the_other_commands_take(
     assert card["arguments"]["width"] == 64
     assert card["command"].startswith("python -m dexzoo fit --config=smoke.yaml")
     assert card["data"]["train_grasps"] == 160
+    assert card["config"]["data"]["batch_size"] == 32
+    assert card["config"]["trainer"]["max_steps"] == 3
+    assert "logger" not in card["config"]["trainer"]
     assert card["metrics"].keys() >= {"validation_auroc", "validation_top1", "validation_loss"}
     assert isinstance(zoo.load(weights.parent), EM2)
     assert (weights.parent / "metrics.csv").is_file()

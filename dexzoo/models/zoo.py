@@ -6,6 +6,7 @@ import difflib
 import hashlib
 import importlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,21 +37,35 @@ def list_models() -> list[str]:
 
 
 def model_class(name: str) -> type[GraspEvaluator]:
-    """The class behind a name. ValueError with the nearest and all names for one that is not known."""
+    """The class behind a name of `list_models`, or a subclass of `GraspEvaluator` that has been imported.
+
+    ValueError with the nearest and all names for one that is not known.
+    """
     if name not in _MODELS:
+        for cls in _subclasses(GraspEvaluator):
+            if cls.__dict__.get("architecture") == name:
+                return cls
         near = difflib.get_close_matches(name, _MODELS, 1, cutoff=0.3)
         hint = f", did you mean {near[0]}?" if near else ";"
-        raise ValueError(f"model {name!r} is unknown{hint} known are {', '.join(_MODELS)}")
+        raise ValueError(f"model {name!r} is unknown{hint} known are {', '.join(_MODELS)}; import your own first")
     module, cls = _MODELS[name].rsplit(".", 1)
     found: type[GraspEvaluator] = getattr(importlib.import_module(module), cls)
     return found
+
+
+def _subclasses(cls: type[GraspEvaluator]) -> Iterator[type[GraspEvaluator]]:
+    """All that are imported, the latest of one parent first: a notebook may define a class again."""
+    for sub in reversed(cls.__subclasses__()):
+        yield sub
+        yield from _subclasses(sub)
 
 
 def load(name_or_path: str | Path) -> GraspEvaluator:
     """An evaluator with its weights, in eval mode, float32, on the CPU.
 
     name_or_path: a name of `list_models`; a .safetensors file with its .json card beside it, or a folder that holds
-    one such pair; or hf://ORGANISATION/REPOSITORY, with huggingface_hub installed. Nothing is ever unpickled.
+    one such pair; or hf://ORGANISATION/REPOSITORY, with huggingface_hub installed. Weights of an architecture of your
+    own need its class to be imported. Nothing is ever unpickled.
 
     Raises FileNotFoundError or ValueError, in one line, that says what is wrong and what to do.
     """
