@@ -23,10 +23,10 @@ p = evaluator.score(observation, grasps)  # (num_grasps,) probabilities of succe
 logit = evaluator.prepare(observation).logit(grasps.to_frame("world", observation.T_world_camera).waypoints)
 ```
 
-In: one depth image with its camera (`dexzoo.Observation`; the object is segmented and the camera turned to it: 224 x 224
-pixels of depth and of height over the table, metres), and grasps (`dexzoo.Grasps`, (num_grasps, 10, 28): ten waypoints
-of wrist position in metres, quaternion wxyz, 20 joint angles in radians, and a type) in the world frame or the camera's.
-Out: the probability that each grasp holds; `logit` gives log-odds, differentiable in the grasps.
+In: one depth image with its camera (`dexzoo.Observation`; the object is segmented and the camera turned to it: 224 x
+224 pixels of depth and of height over the table, metres), and grasps (`dexzoo.Grasps`, (num_grasps, 10, 28): ten
+waypoints of wrist position in metres, quaternion wxyz, 20 joint angles in radians, and a type) in the world frame or
+the camera's. Out: the probability that each grasp holds; `logit` gives log-odds, differentiable in the grasps.
 """
 
 
@@ -96,7 +96,7 @@ def figures(name: str, found: dict[str, Any]) -> str:
 def calibration(name: str) -> str:
     """How log-odds become probabilities."""
     model = load(name)
-    return f"Probabilities: p = sigmoid(logit / {model.temperature:.3f} {'+' if model.offset >= 0 else '-'} {abs(model.offset):.3f}).\n"
+    return f"Probabilities: p = sigmoid(logit / {model.temperature:.3f} {model.offset:+.3f}).\n"
 
 
 def listed(values: dict[str, Any]) -> str:

@@ -205,7 +205,7 @@ def test_your_own_architecture_needs_no_more_than_a_subclass(tmp_path: Path) -> 
     path = YOURS(width=8).save(tmp_path)
     assert isinstance(zoo.load(path), YOURS)
     change_card(path, architecture="three_branches")
-    with pytest.raises(ValueError, match="model 'three_branches' is unknown.*import your own first"):
+    with pytest.raises(ValueError, match=r"model 'three_branches' is unknown.*import your own first"):
         zoo.load(path)
 
 

@@ -42,9 +42,9 @@ def model_class(name: str) -> type[GraspEvaluator]:
     ValueError with the nearest and all names for one that is not known.
     """
     if name not in _MODELS:
-        for cls in _subclasses(GraspEvaluator):
-            if cls.__dict__.get("architecture") == name:
-                return cls
+        for imported in _subclasses(GraspEvaluator):
+            if vars(imported).get("architecture") == name:
+                return imported
         near = difflib.get_close_matches(name, _MODELS, 1, cutoff=0.3)
         hint = f", did you mean {near[0]}?" if near else ";"
         raise ValueError(f"model {name!r} is unknown{hint} known are {', '.join(_MODELS)}; import your own first")
