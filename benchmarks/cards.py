@@ -96,7 +96,10 @@ def figures(name: str, found: dict[str, Any]) -> str:
 def calibration(name: str) -> str:
     """How log-odds become probabilities."""
     model = load(name)
-    return f"Probabilities: p = sigmoid(logit / {model.temperature:.3f} {model.offset:+.3f}).\n"
+    return (
+        f"Calibration: probability = sigmoid(logit / temperature + offset), temperature {model.temperature:.3f}, "
+        f"offset {model.offset:.3f}.\n"
+    )
 
 
 def listed(values: dict[str, Any]) -> str:

@@ -43,18 +43,23 @@ LIMITS = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="a folder that fit has written, or a .safetensors file")
-    parser.add_argument("--limits", nargs="*", default=[], help="sentences, besides those that hold for all models")
+    parser.add_argument("--limits", nargs="*", help="sentences, besides those that hold for all; default: as they were")
     parser.add_argument("--data", default="assets/grasps")
     parser.add_argument("--folder", type=Path, default=resource("checkpoints"))
     options = parser.parse_args()
-    sys.stdout.write(f"{release(options.run, options.folder, options.data, [*LIMITS, *options.limits])}\n")
+    sys.stdout.write(f"{release(options.run, options.folder, options.data, options.limits)}\n")
 
 
-def release(run: Path, folder: Path, data: str, limits: list[str]) -> Path:
-    """Write weights and card into the folder; returns the path of the weights."""
+def release(run: Path, folder: Path, data: str, limits: list[str] | None = None) -> Path:
+    """Write weights and card into the folder; returns the path of the weights.
+
+    limits: of this model, in its card after those that hold for all; None leaves what the card has.
+    """
     model, weights = dexzoo.load(run), run if run.is_file() else next(run.glob("*.safetensors"))
     path, best = folder / f"{model.architecture}.safetensors", run / "checkpoints" / "best.ckpt"
-    card = json.loads(weights.with_suffix(".json").read_text()) | {"limits": limits}
+    card = json.loads(weights.with_suffix(".json").read_text())
+    if limits is not None or "limits" not in card:
+        card["limits"] = [*LIMITS, *(limits or [])]
     if best.is_file():
         full = full_precision(best, dexzoo.load(run))
         differences = compared(model, full, GraspDataModule(data))
