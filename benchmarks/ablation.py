@@ -132,6 +132,7 @@ def configuration(run: Run, data: str, grasps: int) -> dict[str, Any]:
     trainer |= {"max_epochs": -1, "max_steps": steps, "val_check_interval": interval, "check_val_every_n_epoch": None}
     trainer["callbacks"] = [one for one in trainer["callbacks"] if "EarlyStopping" not in one["class_path"]]
     for one in trainer["callbacks"]:
+        one["init_args"]["enable_version_counter"] = False  # what a killed part left is written over
         if one["init_args"]["filename"] == "last":
             one["init_args"]["every_n_train_steps"] = interval
     return config

@@ -8,6 +8,7 @@ checkpoints, such as the shipped one after the grasp set has changed; its precis
 """
 
 import argparse
+import copy
 import json
 import shutil
 import sys
@@ -56,12 +57,11 @@ def release(run: Path, folder: Path, data: str, limits: list[str] | None = None)
     limits: of this model, in its card after those that hold for all; None leaves what the card has.
     """
     model, weights = dexzoo.load(run), run if run.is_file() else next(run.glob("*.safetensors"))
-    path, best = folder / f"{model.architecture}.safetensors", run / "checkpoints" / "best.ckpt"
+    path, full = folder / f"{model.architecture}.safetensors", full_precision(run, model)
     card = json.loads(weights.with_suffix(".json").read_text())
     if limits is not None or "limits" not in card:
         card["limits"] = [*LIMITS, *(limits or [])]
-    if best.is_file():
-        full = full_precision(best, dexzoo.load(run))
+    if full is not None:
         differences = compared(model, full, GraspDataModule(data))
         told = ", ".join(f"{name} {100 * value:.2f}" for name, value in differences.items())
         sys.stderr.write(f"half precision moves figures by points: {told}\n")
@@ -73,11 +73,17 @@ def release(run: Path, folder: Path, data: str, limits: list[str] | None = None)
     return path
 
 
-def full_precision(best: Path, model: GraspEvaluator) -> GraspEvaluator:
-    """The model with the checkpoint's weights, calibrated as it was."""
-    calibration = {"temperature": model.temperature, "offset": model.offset}
-    load_weights(model, read_checkpoint(best) | calibration, best)
-    return model
+def full_precision(run: Path, half: GraspEvaluator) -> GraspEvaluator | None:
+    """The model with the weights that its own were rounded from, calibrated as it is; None where they are not kept."""
+    rounded = dict(half.named_parameters())
+    calibration = {"temperature": half.temperature, "offset": half.offset}
+    for path in sorted((run / "checkpoints").glob("best*.ckpt")):
+        weights = read_checkpoint(path)
+        if all(torch.equal(weights[name].half().float(), value) for name, value in rounded.items()):
+            model = copy.deepcopy(half)
+            load_weights(model, weights | calibration, path)
+            return model
+    return None
 
 
 def compared(model: GraspEvaluator, other: GraspEvaluator, data: GraspDataModule) -> dict[str, float]:

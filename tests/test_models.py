@@ -10,6 +10,7 @@ import pytest
 import synthetic
 import torch
 import torchvision
+import yaml
 from lightning.pytorch import Callback, LightningModule, Trainer
 from safetensors.torch import load_file
 
@@ -51,14 +52,9 @@ def resnet_trunk() -> Iterator[None]:
         yield
 
 
-def example() -> type[GraspEvaluator]:
-    """The architecture of examples/, which is no part of the zoo and keeps the same contract."""
-    path = Path(__file__).parent.parent / "examples" / "02_your_architecture.py"
-    cls: type[GraspEvaluator] = runpy.run_path(str(path), run_name="example")["TwoBranches"]
-    return cls
-
-
-YOURS = example()
+EXAMPLE = Path(__file__).parent.parent / "examples" / "02_your_architecture.py"
+YOURS: type[GraspEvaluator] = runpy.run_path(str(EXAMPLE), run_name="example")["TwoBranches"]
+"""The example's architecture is no part of the zoo and keeps the same contract."""
 
 
 @pytest.fixture(scope="module", params=[*zoo.list_models(), YOURS.architecture])
@@ -319,6 +315,21 @@ def test_fit_writes_a_run_that_load_and_the_other_commands_take(
     resume = ["fit", *SMOKE, *arguments, "--ckpt_path", str(weights.parent / "checkpoints" / "best.ckpt")]
     training.main([*resume, "--trainer.max_steps", "5"])
     assert Path(json.loads(capsys.readouterr().out)["weights"]).is_file()
+
+
+def test_your_own_architecture_is_trained_by_a_configuration(
+    here: Path, arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "mypackage.py").write_text(EXAMPLE.read_text().replace('"two_branches"', '"my_net"'))
+    monkeypatch.syspath_prepend(here)
+    config = yaml.safe_load((resource("configs") / "smoke.yaml").read_text())
+    config["model"] = {"class_path": "mypackage.TwoBranches", "init_args": {"width": 16, "optimizer": "adamw"}}
+    (here / "my_net.yaml").write_text(yaml.safe_dump(config))
+    training.main(["fit", "--config", "my_net.yaml", *arguments, "--json"])
+    weights = Path(json.loads(capsys.readouterr().out)["weights"])
+    assert weights.name == "my_net.safetensors"
+    training.main(["test", "--config", "my_net.yaml", *arguments, "--json", "--ckpt_path", str(weights.parent)])
+    assert json.loads(capsys.readouterr().out)["test_loss"] > 0
 
 
 @pytest.mark.usefixtures("here")

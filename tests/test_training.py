@@ -71,6 +71,24 @@ def test_a_killed_run_goes_on_to_the_same_weights(
     assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
 
 
+def test_a_resumed_run_remembers_the_best_before_the_kill(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = fit(arguments, capsys)
+    checkpoint = torch.load(before / "checkpoints" / "last.ckpt", weights_only=True)
+    (state,) = [one for key, one in checkpoint["callbacks"].items() if "'monitor': 'validation_auroc'" in key]
+    state["best_model_score"] = torch.tensor(2.0)  # what no later validation reaches
+    state["kth_value"], state["best_k_models"] = torch.tensor(2.0), {state["best_model_path"]: torch.tensor(2.0)}
+    torch.save(checkpoint, before / "unbeatable.ckpt")
+    best = torch.load(before / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"]
+    more = ["--trainer.max_steps=15", "--ckpt_path", str(before / "unbeatable.ckpt")]
+    after = fit([*arguments, *more], capsys)
+    assert after != before
+    weights = load_file(after / "em2.safetensors")
+    assert all(torch.equal(value.half(), best[name].half()) for name, value in weights.items() if "head" in name)
+    assert (before / "checkpoints" / "best.ckpt").is_file()
+
+
 def test_balanced_batches_are_balanced_and_go_on() -> None:
     rng = np.random.default_rng(0)
     view = torch.tensor(rng.integers(0, 50, 2000))

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple, TypedDict
 import torch
 from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.trainer.states import TrainerFn
 from safetensors.torch import save_file
 from torch import Tensor
@@ -269,8 +270,12 @@ class GraspEvaluator(LightningModule):
         checkpoint["random_state"] = torch.get_rng_state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up the random state at the next step."""
+        """Take up the random state at the next step, and the best so far, though a resumed run has its own folder."""
         self._random_state = checkpoint["random_state"]
+        for callback in self.trainer.checkpoint_callbacks:
+            state = checkpoint["callbacks"].get(callback.state_key)
+            if isinstance(callback, ModelCheckpoint) and state is not None:
+                state["dirpath"] = callback.dirpath  # with another one Lightning forgets the best score
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Set the random state that a checkpoint kept; what came between, such as making loaders, may have drawn."""
