@@ -44,7 +44,8 @@ def meshes(found: dict[str, Any]) -> str:
             "### On objects from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no "
             "part of dexzoo, 0.2 kg, friction 0.7, the default generator's grasps on one view of each scene. At least "
             f"one grasp holds in {scenes} of {tried} scenes, which bounds every top-1. There is no validation split to "
-            f"choose a threshold for gm on. Objects without any grasp: {without or 'none'}.\n\n"
+            "choose a threshold for gm on; scenes of one object are alike, so that intervals are too narrow. "
+            f"Objects without any grasp: {without or 'none'}.\n\n"
             f"{title(GENERATED, section)}:\n",
             markdown_table(main_table(section)),
             table(
