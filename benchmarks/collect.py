@@ -100,8 +100,11 @@ def loading(folder: str, batch_size: int) -> float:
     data = GraspDataModule(folder, batch_size)
     source = data.source
     encoded = {"features": torch.zeros(source.views.num_rows, FEATURES, dtype=torch.float16)}
-    success, scene = torch.from_numpy(source.success).float(), torch.from_numpy(source.grasp_scene)
-    dataset = GraspDataset(data.waypoints, success, scene, torch.from_numpy(source.grasp_view), encoded)
+    success, scene, view, view_scene = (
+        torch.from_numpy(array) for array in (source.success, source.grasp_scene, source.grasp_view, source.view_scene)
+    )
+    grasps = source.world_grasps.waypoints
+    dataset = GraspDataset(grasps, success.float(), scene, view, encoded, view_scene, data.T_aimed_world)
     fastest = 0.0
     for _ in range(3):
         start = time.perf_counter()

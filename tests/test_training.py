@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 
 import dexzoo
 from dexzoo import training
-from dexzoo.data.datamodule import BalancedBatches
+from dexzoo.data.datamodule import BalancedBatches, GraspDataset
 from dexzoo.models.em2 import EM2
 from dexzoo.models.evaluator import GraspEvaluator
 
@@ -89,14 +89,26 @@ def test_a_resumed_run_remembers_the_best_before_the_kill(
     assert (before / "checkpoints" / "best.ckpt").is_file()
 
 
+def drawn_from(success: torch.Tensor, scene: torch.Tensor) -> GraspDataset:
+    """Grasps of scenes with as many views as the scene's number modulo 3, and one."""
+    view_scene = torch.tensor([number for number in scene.unique().tolist() for _ in range(1 + number % 3)])
+    count, views = len(success), len(view_scene)
+    first = torch.searchsorted(view_scene, scene)
+    return GraspDataset(
+        torch.zeros(count, 10, 28), success, scene, first, {}, view_scene, torch.eye(4).expand(views, 4, 4)
+    )
+
+
 def test_balanced_batches_are_balanced_and_go_on() -> None:
     rng = np.random.default_rng(0)
-    view = torch.tensor(rng.integers(0, 50, 2000))
+    scene = torch.tensor(rng.integers(0, 50, 2000))
     success = torch.tensor(rng.random(2000) < 0.1).float()
+    dataset = drawn_from(success, scene)
     for together in (1, 8):
-        batches = BalancedBatches(success, view, 64, together, seed=3)
+        batches = BalancedBatches(dataset, 64, together, seed=3)
         assert len(batches) == 32
-        drawn = [row for _ in range(40) for batch in batches for row in batch]
+        draws = [draw for _ in range(40) for draw in batches]
+        drawn = [row for draw in draws for row in draw.rows]
         assert float(success[drawn].mean()) == pytest.approx(0.5, abs=0.02)
         # within a class each grasp is as likely as any other: counts are about 0.5 * draws / size of the class
         count = np.bincount(drawn, minlength=2000)
@@ -104,19 +116,24 @@ def test_balanced_batches_are_balanced_and_go_on() -> None:
             expected = 0.5 * len(drawn) / int((success == label).sum())
             assert count[success.numpy() == label].mean() == pytest.approx(expected, rel=0.05)
             assert count[success.numpy() == label].min() > 0
-        other = BalancedBatches(success, view, 64, together, seed=3)
+        # each view shows its own scene, and the views of a scene are as likely
+        seen = torch.tensor([view for draw in draws for view in draw.views])
+        assert torch.equal(dataset.view_scene[seen], scene[drawn])
+        of_three = torch.bincount(seen)[dataset.view_scene % 3 == 2].view(-1, 3)
+        assert (of_three / of_three.sum(1, keepdim=True)).mean(0).tolist() == pytest.approx([1 / 3] * 3, abs=0.03)
+        other = BalancedBatches(dataset, 64, together, seed=3)
         other.drawn = 7
-        again = BalancedBatches(success, view, 64, together, seed=3)
+        again = BalancedBatches(dataset, 64, together, seed=3)
         assert next(iter(other)) == list(again)[7]
-    shown = [len(view[batch].unique()) for batch in BalancedBatches(success, view, 64, 8)]
+    shown = [len(set(draw.views)) for draw in BalancedBatches(dataset, 64, 8)]
     assert max(shown) <= 8
 
 
 def test_processes_share_batches() -> None:
-    success, view = (torch.arange(100) % 2).float(), torch.arange(100) // 10
-    whole = list(BalancedBatches(success, view, 7, 2))
-    parts = [list(BalancedBatches(success, view, 7, 2, rank=rank, world_size=2)) for rank in (0, 1)]
-    assert [a + b for a, b in zip(*parts, strict=True)] == whole
+    dataset = drawn_from((torch.arange(100) % 2).float(), torch.arange(100) // 10)
+    whole = list(BalancedBatches(dataset, 7, 2))
+    parts = [list(BalancedBatches(dataset, 7, 2, rank=rank, world_size=2)) for rank in (0, 1)]
+    assert [(a.rows + b.rows, a.views + b.views) for a, b in zip(*parts, strict=True)] == whole
 
 
 class Alone(GraspEvaluator):

@@ -37,7 +37,7 @@ def draw_inside(models: Mapping[str, GraspEvaluator], data: GraspDataModule, spl
         dataset = data.dataset(split, model)
         rows, features = grasp_features(model, dataset)
         where = "after the hand branch" if BRANCH in dict(model.named_modules()) else "before the last layer"
-        picture = components_picture(dataset.grasps[rows], features, dataset.success[rows] > 0.5, where)
+        picture = components_picture(dataset.aimed(rows), features, dataset.success[rows] > 0.5, where)
         save(picture, folder / f"{stem}_grasps.png")
 
 
@@ -65,7 +65,7 @@ def grasp_features(model: GraspEvaluator, dataset: GraspDataset) -> tuple[Tensor
         for i, (part, scene) in enumerate(encoded_views(model, dataset)):
             if i % step == 0:
                 recorded.clear()
-                model.logit(scene, dataset.grasps[part][None].to(model.device))
+                model.logit(scene, dataset.aimed(part)[None].to(model.device))
                 rows.append(part)
                 features.append(recorded[-1].float().cpu().reshape(len(part), -1))
     return torch.cat(rows), torch.cat(features)

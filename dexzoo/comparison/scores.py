@@ -132,7 +132,7 @@ def model_scores(model: GraspEvaluator, dataset: GraspDataset, title: str) -> Sc
     views = encoded_views(model, dataset)
     num_views = len(dataset.view.unique())
     for rows, scene in track(views, title, num_views, transient=True, disable=not sys.stderr.isatty()):
-        logit[rows] = model.logit(scene, dataset.grasps[rows][None].to(model.device))[0].float().cpu()
+        logit[rows] = model.logit(scene, dataset.aimed(rows)[None].to(model.device))[0].float().cpu()
     if wrong := int((~logit.isfinite()).sum()):
         raise ValueError(f"{title}: {wrong} of {len(logit)} scores are nan or infinite; the weights are of no use")
     return Scores(logit.numpy(), 0.5, model.probability(logit).numpy())

@@ -9,9 +9,11 @@ import sys
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from lightning.pytorch import LightningDataModule
 from rich.progress import track
 from safetensors import SafetensorError
@@ -35,58 +37,84 @@ STATISTICS_VIEWS = 256
 _log = logging.getLogger(__name__)
 
 
-class GraspDataset(Dataset[Batch]):
-    """Whole batches by lists of indices: gathers from tensors, no work by row.
+class Draw(NamedTuple):
+    """Grasps of a dataset, by row, and the views that they are seen in, by row of its views."""
 
-    view: (num_grasps,) row of each grasp's view in `views`, which are encoded, or images.
+    rows: list[int]
+    views: list[int]
+
+
+class GraspDataset(Dataset[Batch]):
+    """Whole batches by lists of rows, or by draws: gathers from tensors, no work by row.
+
+    grasps: (num_grasps, 10, 28) in the world frame. view: (num_grasps,) the row of the view that each is paired with.
+    views: encoded, or images. view_scene: (num_views,) the scene that each shows. T_aimed_world: (num_views, 4, 4),
+    world frame to the frame of its aimed camera.
     """
 
     def __init__(
-        self, grasps: Tensor, success: Tensor, scene_index: Tensor, view: Tensor, views: Scene | ViewImages
+        self,
+        grasps: Tensor,
+        success: Tensor,
+        scene_index: Tensor,
+        view: Tensor,
+        views: Scene | ViewImages,
+        view_scene: Tensor,
+        T_aimed_world: Tensor,
     ) -> None:
-        self.grasps, self.success, self.scene_index = grasps, success, scene_index
-        self.view, self.views = view, views
+        self.grasps, self.success, self.scene_index, self.view = grasps, success, scene_index, view
+        self.views, self.view_scene, self.T_aimed_world = views, view_scene, T_aimed_world
 
     def __len__(self) -> int:
         return len(self.grasps)
 
-    def __getitem__(self, index: list[int]) -> Batch:
-        rows = torch.tensor(index)
-        shown, view = self.view[rows].unique(return_inverse=True)
+    def __getitem__(self, index: list[int] | Draw) -> Batch:
+        rows = torch.tensor(index.rows if isinstance(index, Draw) else index)
+        view = torch.tensor(index.views) if isinstance(index, Draw) else self.view[rows]
+        shown, place = view.unique(return_inverse=True)
         views: Scene | Tensor
         if isinstance(self.views, ViewImages):
             views = self.views[shown]
         else:
             views = {name: value[shown] for name, value in self.views.items()}
-        return Batch(views, view, self.grasps[rows, None], self.success[rows], self.scene_index[rows])
+        return Batch(views, place, self.aimed(rows, view)[:, None], self.success[rows], self.scene_index[rows])
+
+    def aimed(self, rows: Tensor, view: Tensor | None = None) -> Float[Tensor, "batch 10 28"]:
+        """Grasps in the frames of the aimed cameras of views; by default of those that they are paired with."""
+        return transform_waypoints(self.T_aimed_world[self.view[rows] if view is None else view], self.grasps[rows])
 
 
-class BalancedBatches(Sampler[list[int]]):
+class BalancedBatches(Sampler[Draw]):
     """Batches with as many successes as failures, drawn with replacement; goes on where it was stopped.
 
+    Each time that a grasp is drawn, it is seen in another view of its scene, any being as likely.
     The batch with number n is a function of the seed and n alone. Each call of `iter` hands out as many batches as
     an epoch has, from number `drawn` on.
 
-    success, view: (num_grasps,) of the dataset. batch_size: grasps in a batch, shared among processes.
-    grasps_per_view: grasps of a batch that share a view, drawn with the views' own weights, so that each grasp is as
-    likely as it is with 1. rank, world_size: which part of each batch this process takes, of how many.
+    batch_size: grasps in a batch, shared among processes. grasps_per_view: grasps of a batch that share a view; scenes
+    are then drawn with their own weights, so that each grasp is as likely as it is with 1.
+    rank, world_size: which part of each batch this process takes, of how many.
     """
 
     def __init__(
         self,
-        success: Tensor,
-        view: Tensor,
+        dataset: GraspDataset,
         batch_size: int,
         grasps_per_view: int = 1,
         seed: int = 0,
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
-        share = 1 / torch.bincount(success.long(), minlength=2).double()
-        self.order = view.argsort(stable=True).numpy()  # grasps of a view stand together
-        self.end = share[success.long()].numpy()[self.order].cumsum()
-        last = np.flatnonzero(np.diff(view.numpy()[self.order], append=-1))
-        self.view_end = self.end[last]
+        success, scene = dataset.success.long(), dataset.scene_index
+        share = 1 / torch.bincount(success, minlength=2).double()
+        self.order = scene.argsort(stable=True).numpy()  # grasps of a scene stand together
+        self.end = share[success].numpy()[self.order].cumsum()
+        scenes, count = scene.unique(return_counts=True)
+        self.scene_end = self.end[count.numpy().cumsum() - 1]
+        self.view_order = dataset.view_scene.argsort(stable=True).numpy()
+        sorted_scene = dataset.view_scene.numpy()[self.view_order]
+        self.first_view = np.searchsorted(sorted_scene, scenes.numpy())
+        self.num_views = np.searchsorted(sorted_scene, scenes.numpy(), side="right") - self.first_view
         self.batch_size, self.grasps_per_view, self.seed = batch_size, grasps_per_view, seed
         self.part = slice(rank * batch_size // world_size, (rank + 1) * batch_size // world_size)
         self.drawn = 0
@@ -94,21 +122,22 @@ class BalancedBatches(Sampler[list[int]]):
     def __len__(self) -> int:
         return -(-len(self.order) // self.batch_size)
 
-    def __iter__(self) -> Iterator[list[int]]:
+    def __iter__(self) -> Iterator[Draw]:
         for _ in range(len(self)):
             self.drawn += 1
             yield self.batch(self.drawn - 1)
 
-    def batch(self, number: int) -> list[int]:
-        """The rows of a batch, or of this process's part of it."""
+    def batch(self, number: int) -> Draw:
+        """What a batch, or this process's part of it, is made of."""
         rng = np.random.default_rng((self.seed, number))
         num_views = -(-self.batch_size // self.grasps_per_view)
-        view = np.searchsorted(self.view_end, self.end[-1] * rng.random(num_views), side="right")
-        low, high = np.append(0.0, self.view_end)[view], self.view_end[view]
+        scene = np.searchsorted(self.scene_end, self.end[-1] * rng.random(num_views), side="right")
+        view = self.view_order[self.first_view[scene] + rng.integers(self.num_views[scene])]
+        low, high = np.append(0.0, self.scene_end)[scene], self.scene_end[scene]
         place = low + (high - low) * rng.random((self.grasps_per_view, num_views))
         rows = self.order[np.searchsorted(self.end[:-1], place.T.ravel(), side="right")]
-        chosen: list[int] = rows[: self.batch_size][self.part].tolist()
-        return chosen
+        views = view.repeat(self.grasps_per_view)
+        return Draw(*(part[: self.batch_size][self.part].tolist() for part in (rows, views)))
 
 
 class ResumableLoader(DataLoader[Batch]):
@@ -184,8 +213,13 @@ class GraspDataModule(LightningDataModule):
     @cached_property
     def waypoints(self) -> Tensor:
         """(num_grasps, 10, 28) all grasps, each in the frame of the aimed camera of its view."""
-        T_camera_world = torch.linalg.inv(self.source.camera_poses.double()).float()
-        return transform_waypoints(T_camera_world[self.source.grasp_view], self.source.world_grasps.waypoints)
+        return transform_waypoints(self.T_aimed_world[self.source.grasp_view], self.source.world_grasps.waypoints)
+
+    @cached_property
+    def T_aimed_world(self) -> Tensor:
+        """(num_views, 4, 4) world frame to the frame of each view's aimed camera."""
+        T: Tensor = torch.linalg.inv(self.source.camera_poses.double())
+        return T.float()
 
     def setup(self, stage: str) -> None:
         """Before fitting, give the model the statistics of the training data."""
@@ -201,21 +235,24 @@ class GraspDataModule(LightningDataModule):
         model.fit_statistics(images.to(model.device), self.waypoints[rows].to(model.device))
 
     def dataset(self, split: str, model: GraspEvaluator, sources: list[str] | None = None) -> GraspDataset:
-        """The grasps of a split, with their views encoded by the model where its encoder is frozen.
+        """The grasps of a split and all views of their scenes, encoded by the model where its encoder is frozen.
 
         sources: those that are taken; by default `sources` for training and `evaluation_sources` for the rest.
         """
         if sources is None:
             sources = self.sources if split == "train" else self.evaluation_sources
         rows = self._rows(split, sources)
-        shown, view = torch.from_numpy(self.source.grasp_view)[rows].unique(return_inverse=True)
+        scene, view_scene = (torch.from_numpy(array) for array in (self.source.grasp_scene, self.source.view_scene))
+        shown = torch.isin(view_scene, scene[rows]).nonzero()[:, 0]
         views = shown.tolist()
         return GraspDataset(
-            self.waypoints[rows],
+            self.source.world_grasps.waypoints[rows],
             torch.from_numpy(self.source.success).float()[rows],
-            torch.from_numpy(self.source.grasp_scene)[rows],
-            view,
+            scene[rows],
+            torch.searchsorted(shown, torch.from_numpy(self.source.grasp_view)[rows]),
             self._encode(views, model) if model.frozen_encoder else self.source.images(views),
+            view_scene[shown],
+            self.T_aimed_world[shown],
         )
 
     def loader(self, dataset: GraspDataset, *, balanced: bool = False) -> DataLoader[Batch]:
@@ -232,7 +269,7 @@ class GraspDataModule(LightningDataModule):
         if not torch.bincount(dataset.success.long(), minlength=2).all():
             raise ValueError(f"grasp set {self.folder}: training needs both successes and failures")
         together = GRASPS_PER_VIEW if isinstance(dataset.views, ViewImages) else 1
-        drawn = BalancedBatches(dataset.success, dataset.view, self.batch_size, together, self.seed, rank, world_size)
+        drawn = BalancedBatches(dataset, self.batch_size, together, self.seed, rank, world_size)
         return ResumableLoader(dataset, sampler=drawn, batch_size=None, generator=unused)
 
     def train_dataloader(self) -> DataLoader[Batch]:
