@@ -125,6 +125,12 @@ def test_a_round_can_be_continued_and_repeated(folder: Path, evaluator: str, tmp
     assert (folder / "grasps" / "refined1_00000.parquet").read_bytes() == kept
     other = list(collect_refined(folder, Refining(evaluator, round=2, num_grasps=2)))
     assert other[0].startswith("refined2_00000:")
+    with pytest.raises(ValueError, match=r"refined1 of grasp set .* was made with .*'num_grasps': 2.*; start another"):
+        next(iter(collect_refined(folder, Refining(evaluator, num_grasps=3))))
+    torch.manual_seed(1)
+    stranger = str(EMFK(width=32, num_blocks=1, image=False).save(tmp_path / "stranger"))
+    with pytest.raises(ValueError, match="start another --round"):
+        next(iter(collect_refined(folder, Refining(stranger, num_grasps=2))))
     part = "grasps/refined1_00001.parquet"
     content = (folder / part).read_bytes()
     with GraspSetWriter(folder, {}, 0) as writer:

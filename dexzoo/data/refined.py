@@ -6,6 +6,7 @@ of the grasps that it liked best is what it has to learn next.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cache, partial
@@ -45,23 +46,38 @@ class Refining:
     seed: int = 0
     num_grasps: int = 40
 
+    @property
+    def name(self) -> str:
+        """What the round is called in the manifest and in names of files."""
+        return f"refined{self.round}"
+
     def part(self, number: int) -> str:
         """Name of the file of a slice."""
-        return f"refined{self.round}_{number:05d}"
+        return f"{self.name}_{number:05d}"
+
+    def describe(self) -> dict[str, str | int]:
+        """What the manifest says of how a round was made; of the evaluator, the checksum of its weights."""
+        weights = load(self.evaluator).state_dict()
+        digest = hashlib.sha256(b"".join(value.numpy().tobytes() for value in weights.values())).hexdigest()
+        return {"evaluator": digest, "seed": self.seed, "num_grasps": self.num_grasps}
 
 
 def collect_refined(folder: Path, how: Refining, workers: int = 1) -> Iterator[str]:
     """Refine grasps of the set's training scenes, try them and add them, slice by slice; yields a line on each.
 
-    Slices that are there are left alone, so that a round can be continued; start a new one for another evaluator. The
-    files are the same on any number of workers. A refined grasp is paired with the view that it was refined on. Grasps
+    Slices that are there are left alone, so that a round can be continued. The files are the same on any number of
+    workers. A refined grasp is paired with the view that it was refined on. Grasps
     that refinement did not replace are in the set already.
     Raises what `GraspSet`, `GraspSetWriter` and `dexzoo.load` raise, ValueError for a set without simulated training
-    scenes.
+    scenes, or with a round of the same number that is another evaluator's.
     """
-    load(how.evaluator)  # whether it can be
+    made = how.describe()
     numbers = slices(folder)
     with GraspSetWriter(folder, {}, 0) as writer:
+        try:
+            writer.settle(how.name, made)
+        except ValueError as error:
+            raise ValueError(f"{error}; start another --round") from None
         there = [number for number in numbers if f"grasps/{how.part(number)}.parquet" in writer.manifest["files"]]
         missing = [number for number in numbers if number not in there]
         yield from (f"{how.part(number)} is there already" for number in there)

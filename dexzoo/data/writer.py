@@ -161,6 +161,12 @@ class GraspSetWriter:
         """Add grasps of scenes that are there as a file of their own, grasps/PART.parquet, replacing it if there."""
         self._write_table("grasps", part, grasps.cast(SCHEMAS["grasps"]))
 
+    def settle(self, name: str, value: Mapping[str, Any]) -> None:
+        """Add how a part is made to the configuration. ValueError if the same part was begun otherwise."""
+        there = self.manifest["configuration"].setdefault(name, dict(value))
+        if there != value:
+            raise ValueError(f"{name} of grasp set {self.folder} was made with {there}, not {dict(value)}")
+
     def _write_table(self, name: str, shard: str, table: pa.Table, save: bool = True) -> None:
         path = self.folder / name / f"{shard}.parquet"
         path.parent.mkdir(exist_ok=True)
