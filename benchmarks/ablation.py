@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 import yaml
 from numpy.typing import NDArray
 
@@ -167,12 +168,13 @@ def described(folder: Path, model: GraspEvaluator, data: GraspDataModule) -> dic
     if card["data"]["sha256"] != data.source.sha256:
         raise ValueError(f"{folder} was trained on another grasp set than {data.folder}; run it anew")
     config = yaml.safe_load(asked(folder).read_text())
-    image, shown = first_image(data, "test"), data.dataset("test", model, [SOURCES[0]]).grasps
+    dataset = data.dataset("test", model, [SOURCES[0]])
+    image, grasps = first_image(data, "test"), dataset.aimed(torch.arange(len(dataset)))
     return {
         "grasps_seen": config["trainer"]["max_steps"] * config["data"]["batch_size"],
         "train_grasps": card["data"]["train_grasps"],
         "validation_auroc": card["metrics"]["validation_auroc"],
-        "cost": asdict(measure(model, image, shown)),
+        "cost": asdict(measure(model, image, grasps)),
     }
 
 

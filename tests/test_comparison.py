@@ -192,7 +192,7 @@ def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
     torch.testing.assert_close(features[:3], branch.flatten(1), atol=1e-4, rtol=1e-4)
     rows, features = grasp_features(Closure(), dataset)
     hand = default_hand()
-    share = (hand.reduce(dataset.grasps[rows, SQUEEZE, JOINTS]) - hand.reduce(hand.lower)) / hand.reduce(
+    share = (hand.reduce(dataset.world_grasps[rows, SQUEEZE, JOINTS]) - hand.reduce(hand.lower)) / hand.reduce(
         hand.upper - hand.lower
     )
     torch.testing.assert_close(features, share)

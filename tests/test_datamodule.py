@@ -196,7 +196,7 @@ def test_a_share_of_the_training_scenes(folder: Path, em2: EM2, tmp_path: Path) 
     assert data.dataset("train", em2).scene_index.unique().tolist() == [0, 1]  # 0.6 of four, rounded
     assert data.describe()["train_grasps"] == 80
     for split in ("validation", "test"):
-        assert torch.equal(data.dataset(split, em2).grasps, whole.dataset(split, em2).grasps)
+        assert torch.equal(data.dataset(split, em2).world_grasps, whole.dataset(split, em2).world_grasps)
     statistics = EM2(width=16)
     data.fit_statistics(statistics)
     expected = whole.waypoints[torch.from_numpy(whole.source.grasp_scene) < 2]

@@ -7,6 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from dexzoo.comparison.figures import NUM_DRAWS, against, describe, draw_scenes
 from dexzoo.comparison.scores import (
     COIN,
@@ -68,7 +70,7 @@ def compare(
             dataset = data.dataset(split, model, [source])
             rows[source][name] = model_scores(model, dataset, f"{name} on {source} grasps")
             if source == GENERATED:
-                cost[name] = asdict(measure(model, image, dataset.grasps))
+                cost[name] = asdict(measure(model, image, dataset.aimed(torch.arange(len(dataset)))))
     validation = read_labels(data, "validation", GENERATED)
     return {
         "split": split,

@@ -47,14 +47,14 @@ class Draw(NamedTuple):
 class GraspDataset(Dataset[Batch]):
     """Whole batches by lists of rows, or by draws: gathers from tensors, no work by row.
 
-    grasps: (num_grasps, 10, 28) in the world frame. view: (num_grasps,) the row of the view that each is paired with.
-    views: encoded, or images. view_scene: (num_views,) the scene that each shows. T_aimed_world: (num_views, 4, 4),
-    world frame to the frame of its aimed camera.
+    world_grasps: (num_grasps, 10, 28) waypoints in the world frame. view: (num_grasps,) the row of the view that each
+    is paired with. views: encoded, or images. view_scene: (num_views,) the scene that each shows. T_aimed_world:
+    (num_views, 4, 4), world frame to the frame of its aimed camera.
     """
 
     def __init__(
         self,
-        grasps: Tensor,
+        world_grasps: Tensor,
         success: Tensor,
         scene_index: Tensor,
         view: Tensor,
@@ -62,11 +62,11 @@ class GraspDataset(Dataset[Batch]):
         view_scene: Tensor,
         T_aimed_world: Tensor,
     ) -> None:
-        self.grasps, self.success, self.scene_index, self.view = grasps, success, scene_index, view
+        self.world_grasps, self.success, self.scene_index, self.view = world_grasps, success, scene_index, view
         self.views, self.view_scene, self.T_aimed_world = views, view_scene, T_aimed_world
 
     def __len__(self) -> int:
-        return len(self.grasps)
+        return len(self.world_grasps)
 
     def __getitem__(self, index: list[int] | Draw) -> Batch:
         rows = torch.tensor(index.rows if isinstance(index, Draw) else index)
@@ -81,7 +81,8 @@ class GraspDataset(Dataset[Batch]):
 
     def aimed(self, rows: Tensor, view: Tensor | None = None) -> Float[Tensor, "batch 10 28"]:
         """Grasps in the frames of the aimed cameras of views; by default of those that they are paired with."""
-        return transform_waypoints(self.T_aimed_world[self.view[rows] if view is None else view], self.grasps[rows])
+        view = self.view[rows] if view is None else view
+        return transform_waypoints(self.T_aimed_world[view], self.world_grasps[rows])
 
 
 class BalancedBatches(Sampler[Draw]):
