@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import dexzoo
 from dexzoo import training
-from dexzoo.comparison.figures import draw_scenes, figures
+from dexzoo.comparison.figures import draw_scenes, figures, with_interval
 from dexzoo.comparison.scores import Labels, first_image, measure, model_scores, read_labels
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.models.evaluator import GraspEvaluator
@@ -188,11 +188,7 @@ def replicated(model: GraspEvaluator, data: GraspDataModule, labels: Labels, sou
 
 def with_intervals(found: dict[str, Replicates]) -> dict[str, Any]:
     """Value and 95 % interval of each figure."""
-    out = {}
-    for key, (value, *draws) in found.items():
-        interval = np.percentile([draw for draw in draws if np.isfinite(draw)], [2.5, 97.5])
-        out[key] = {"value": round(float(value), 6), "interval": [round(float(end), 6) for end in interval]}
-    return out
+    return {key: with_interval(replicates[:1], replicates[1:]) for key, replicates in found.items()}
 
 
 if __name__ == "__main__":

@@ -49,10 +49,10 @@ def describe(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
     value, replicates = figures(labels, scores, once), figures(labels, scores, draws)
     tenths = by_scene(SuccessByRank(), labels, scores).T
     return {
-        "figures": {name: _figure(value[name], replicates[name]) for name in value},
+        "figures": {name: with_interval(value[name], replicates[name]) for name in value},
         "threshold": scores.threshold,
         "counts": counts(labels, scores),
-        "by_rank": [_figure(mean(tenth, once), mean(tenth, draws)) for tenth in tenths],
+        "by_rank": [with_interval(mean(tenth, once), mean(tenth, draws)) for tenth in tenths],
         "reliability": reliability(labels, scores),
         "by_category": {str(name): _of_category(name, labels, scores) for name in np.unique(labels.category)},
     }
@@ -179,7 +179,7 @@ def _of_category(name: str, labels: Labels, scores: Scores) -> dict[str, Any]:
     }
 
 
-def _figure(value: Array, replicates: Array) -> dict[str, Any]:
+def with_interval(value: Array, replicates: Array) -> dict[str, Any]:
     """A figure and its 95 % interval, from the replicates for which it is defined."""
     known = replicates[np.isfinite(replicates)]
     interval = [_plain(x) for x in np.percentile(known, [2.5, 97.5])] if len(known) else None

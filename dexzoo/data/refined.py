@@ -66,8 +66,8 @@ def collect_refined(folder: Path, how: Refining, workers: int = 1) -> Iterator[s
     """Refine grasps of the set's training scenes, try them and add them, slice by slice; yields a line on each.
 
     Slices that are there are left alone, so that a round can be continued. The files are the same on any number of
-    workers. A refined grasp is paired with the view that it was refined on. Grasps
-    that refinement did not replace are in the set already.
+    workers. A refined grasp is paired with the view that it was refined on. Grasps that refinement did not replace are
+    in the set already.
     Raises what `GraspSet`, `GraspSetWriter` and `dexzoo.load` raise, ValueError for a set without simulated training
     scenes, or with a round of the same number that is another evaluator's.
     """
