@@ -21,14 +21,14 @@ from dexzoo.data.collect import Configuration, collect
 from dexzoo.data.datamodule import GraspDataModule, GraspDataset
 
 NUM_KILLS = 10
-LONGEST = 30.0
+LONGEST = 15.0
 """Seconds that a run lives at most before it is killed."""
 FEATURES = 512
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=30)
+    parser.add_argument("--scenes", type=int, default=40)
     parser.add_argument("--generator", default="heuristic")
     parser.add_argument("--data", default="assets/grasps")
     parser.add_argument("--out", type=Path)

@@ -87,7 +87,6 @@ def count(data: GraspSet, manifest: dict) -> dict[str, object]:
         "unstable": int(np.sum(data.grasps["unstable"].to_numpy())),
         "duplicates": len(data.paths) - len(np.unique(data.paths, axis=0)),
         "outside_limits": outside_limits(data),
-        "repeated": repeated(data),
         "by_split": by(np.array(SPLITS)[data.grasp_split], every),
         "by_source": by(data.source, every),
         "by_category": by(category, generated),
@@ -102,20 +101,6 @@ def outside_limits(data: GraspSet) -> int:
     joints = data.world_grasps.joints
     wrong = (joints < hand.lower - 1e-4) | (joints > hand.upper + 1e-4)
     return int(wrong.flatten(1).any(1).sum())
-
-
-def repeated(data: GraspSet) -> dict[str, float] | None:
-    """How sure the outcome of a grasp is, where grasps were tried more than once."""
-    rate = data.grasps["success_rate"].to_numpy()
-    rate = rate[np.isfinite(rate)]
-    if not len(rate):
-        return None
-    return {
-        "grasps": len(rate),
-        "mean_rate": float(rate.mean()),
-        "always_the_same": float(np.isin(rate, (0, 1)).mean()),
-        "best_accuracy": float(np.maximum(rate, 1 - rate).mean()),
-    }
 
 
 def agreement(data: GraspSet, num: int) -> dict[str, object]:

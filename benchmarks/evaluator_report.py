@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from tables import RESULTS, read, span, table
+from tables import RESULTS, percent, read, span, table
 
 from dexzoo.comparison.report import NOTES, cost_table, counts_table, main_table, title
 from dexzoo.comparison.report import table as markdown_table
@@ -14,7 +14,13 @@ WITHOUT, LESS_DATA, VARIANT = "-", "@", "+"
 
 def evaluators() -> str:
     """All that has been measured of the evaluators; each part as soon as its benchmark has been run."""
-    parts = {"comparison": comparison, "evaluators_meshes": meshes, "ablation": ablation, "training": training}
+    parts = {
+        "comparison": comparison,
+        "repeated": repeated,
+        "evaluators_meshes": meshes,
+        "ablation": ablation,
+        "training": training,
+    }
     return "\n".join(write(read(name)) for name, write in parts.items() if (RESULTS / f"{name}.json").exists())
 
 
@@ -31,6 +37,31 @@ def comparison(found: dict[str, Any]) -> str:
         "![Success of the first grasp by category](comparison/categories.png)\n",
     ]
     return "\n".join(parts)
+
+
+def repeated(found: dict[str, Any]) -> str:
+    """How far an outcome can be foreseen, and how far evaluators do."""
+    return (
+        f"### How far an outcome can be foreseen\n\n`benchmarks/repeated.py`; {found['grasps']:,} generated grasps in "
+        f"{found['scenes']} scenes of {found['objects']} test objects, each tried {found['trials']} times under drawn "
+        f"mass, friction and wrist error: {percent(found['always_the_same'])} always hold or always fail, the mean "
+        f"rate is {percent(found['mean_rate'])}, and {percent(found['hold_as_they_are'])} hold when tried as they are. "
+        "Every trial is a label; what foresees it best lies between the rate of all trials, which knows the trial "
+        "itself, and that of the others. Evaluators have learnt from trials of grasps as they are.\n\n"
+    ) + table(
+        ("foreseen by", "accuracy, %", "AUROC", "Brier", "calibration error"),
+        [
+            (
+                name,
+                *(
+                    f"{scale * row[key]['value']:.{digits}f} ({span(row[key]['interval'], scale, digits)})"
+                    for key, scale, digits in (("accuracy", 100, 1), ("auroc", 1, 3), ("brier", 1, 3))
+                ),
+                f"{row['calibration_error']['value']:.3f}",
+            )
+            for name, row in found["rows"].items()
+        ],
+    )
 
 
 def meshes(found: dict[str, Any]) -> str:

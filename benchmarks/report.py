@@ -76,18 +76,12 @@ def counts() -> str:
     for name, head in names.items():
         rows = [(value, f"{row['grasps']:,}", percent(row["hold"])) for value, row in data[f"by_{name}"].items()]
         lines.append(table((head, "grasps" if name in ("split", "source") else "generated grasps", "hold"), rows))
-    again, repeated = data.get("tried_again"), data["repeated"]
+    again = data.get("tried_again")
     if again:
         lines.append(
             f"{again['grasps']} grasps tried again: {percent(again['agree_at_working_setting'])} of the labels come "
             f"out the same at the working setting, {percent(again['agree_at_reference_setting'])} at the reference "
             f"({1000 * again['reference']['timestep']:g} ms).\n"
-        )
-    if repeated:
-        lines.append(
-            f"{repeated['grasps']:,} grasps were repeated under drawn mass, friction and wrist error: "
-            f"{percent(repeated['always_the_same'])} always hold or always fail, and who knew each rate would be right "
-            f"in {percent(repeated['best_accuracy'])} of the trials.\n"
         )
     made = data["configuration"]
     physics = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in made["physics"].items())
