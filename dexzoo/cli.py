@@ -94,7 +94,7 @@ def _parser() -> ArgumentParser:
         command.add_argument(
             "--camera", type=Path, required=True, help="JSON: width, height, fx, fy, cx, cy, depth_scale, table_plane"
         )
-        command.add_argument("--evaluator", default="em2", help="name, file, folder or hf:// address of the model")
+        command.add_argument("--evaluator", default="em_fk", help="name, file, folder or hf:// address of the model")
 
     command = add("plan", "Propose and rank grasps for one depth image.")
     add_observation(command)
@@ -123,7 +123,7 @@ def _parser() -> ArgumentParser:
     command.add_argument("--grasps", type=Path, help="file of grasps in the world frame; otherwise they are generated")
     command.add_argument("--num_grasps", type=PositiveInt, default=50, help="candidates to generate from one view")
     command.add_argument("--generator", default="kopicki", help=GENERATOR)
-    command.add_argument("--evaluator", default="em2", help="name or path of the model that ranks them")
+    command.add_argument("--evaluator", default="em_fk", help="name or path of the model that ranks them")
     command.add_argument(
         "--trials", type=PositiveInt, default=1, help="repetitions under drawn mass, friction and wrist error"
     )

@@ -47,7 +47,7 @@ def generate(
 
 def plan(
     observation: Observation,
-    evaluator: str | GraspEvaluator = "em2",
+    evaluator: str | GraspEvaluator = "em_fk",
     num_grasps: int = 100,
     num_refined: int = 0,
     seed: int = 0,

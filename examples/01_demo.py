@@ -34,8 +34,8 @@ def main() -> None:
     scene = dexzoo.sim.Scene.place(make_object(options.object), seed=options.seed)
     observation = scene.observe(seed=options.seed)
 
-    console.print("Generating candidates, ranking them by em2, refining the best ...")
-    plan = dexzoo.plan(observation, "em2", options.num_grasps, NUM_REFINED, options.seed)
+    console.print("Generating candidates, ranking them by em_fk, refining the best ...")
+    plan = dexzoo.plan(observation, "em_fk", options.num_grasps, NUM_REFINED, options.seed)
 
     console.print("Executing all of them in MuJoCo ...")
     outcomes = dexzoo.verify(plan.grasps, scene, seed=options.seed)

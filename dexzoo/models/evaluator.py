@@ -220,10 +220,18 @@ class GraspEvaluator(LightningModule):
     # training
 
     def batch_logit(self, batch: Batch) -> Float[Tensor, " batch"]:
-        """Log-odds of success of a batch's grasps; each view is encoded once."""
+        """Log-odds of success of a batch's grasps; each view is encoded once, and looked at by its grasps together."""
         views = self.encode(batch.views) if isinstance(batch.views, Tensor) else batch.views
-        scene = {name: value[batch.view] for name, value in views.items()}
-        return self.logit(scene, batch.grasps)[:, 0].float()
+        counts = torch.bincount(batch.view)
+        order = batch.view.argsort(stable=True)
+        count_of_row = counts[batch.view[order]]
+        parts, logits = [], []
+        for count in counts.unique():  # views with as many grasps go at once
+            rows = order[count_of_row == count].view(-1, int(count))
+            scene = {name: value[counts == count] for name, value in views.items()}
+            parts.append(rows.flatten())
+            logits.append(self.logit(scene, batch.grasps[rows, 0]).flatten())
+        return torch.cat(logits)[torch.cat(parts).argsort()].float()
 
     def _step(self, batch: Batch, stage: str) -> Tensor:
         """Loss and metrics of one batch.

@@ -56,7 +56,7 @@ class Refinement:
 def refine(
     grasps: Grasps,
     depth: NDArray[np.floating] | Observation,
-    evaluator: str | GraspEvaluator = "em2",
+    evaluator: str | GraspEvaluator = "em_fk",
     camera: Camera | None = None,
     *,
     judge: str | GraspEvaluator | None = None,
