@@ -53,9 +53,10 @@ def main() -> None:
 
 
 def release(run: Path, folder: Path, data: str, limits: list[str] | None = None, name: str | None = None) -> Path:
-    """Write weights and card into the folder, under the architecture's name or another; returns the path of the weights.
+    """Write weights and card into the folder; returns the path of the weights.
 
-    limits: of this model, in its card after those that hold for all; None leaves what the card has.
+    limits: of this model, in its card after those that hold for all; None leaves what the card has. name: of the files,
+    by default the architecture's.
     """
     model, weights = dexzoo.load(run), run if run.is_file() else next(run.glob("*.safetensors"))
     path, full = folder / f"{name or model.architecture}.safetensors", full_precision(run, model)
