@@ -81,7 +81,7 @@ def variants(options: argparse.Namespace) -> dict[str, Variant]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--evaluator", default="em2", help="what guides: name, file or folder")
+    parser.add_argument("--evaluator", default="em_fk", help="what guides: name, file or folder")
     parser.add_argument("--judge", help="what accepts, the same")
     parser.add_argument("--others", nargs="*", default=[], help="evaluators that guide in its place, each a variant")
     parser.add_argument("--tries", type=Path, help="JSON of further variants")

@@ -34,7 +34,7 @@ NOTHING = Weights(**dict.fromkeys(asdict(Weights()), 0.0))
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--evaluator", default="em2", help="name, file or folder")
+    parser.add_argument("--evaluator", default="em_fk", help="name, file or folder")
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()

@@ -111,7 +111,7 @@ def _parser() -> ArgumentParser:
     command.add_argument("--judge", help="model that a refined grasp must please too; as --evaluator")
     command.add_argument("--margin", type=float, default=0.0, help="log-odds by which the judge must find it better")
     command.add_argument("--optimiser", default="adam", choices=list(OPTIMISERS), help="how the objective is climbed")
-    command.add_argument("--num_steps", type=NonNegativeInt, default=20, help="evaluations of each grasp")
+    command.add_argument("--num_steps", type=NonNegativeInt, default=30, help="evaluations of each grasp")
     command.add_argument("--out", type=Path, help="file for the refined grasps (.safetensors)")
     command.add_argument("--picture", type=Path, help="file for the best grasp before and after (.png)")
 

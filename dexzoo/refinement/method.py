@@ -62,7 +62,7 @@ def refine(
     judge: str | GraspEvaluator | None = None,
     margin: float = 0.0,
     optimiser: Literal["adam", "lbfgs", "metropolis", "random"] = "adam",
-    num_steps: int = 20,
+    num_steps: int = 30,
     step_size: float = 0.2,
     variables: Literal["grip", "uncoupled", "waypoints"] = "grip",
     region: Region | None = None,

@@ -31,11 +31,11 @@ class Weights:
     """
 
     spread: float = 1.0
-    prior: float = 0.1
-    penetration: float = 100.0
-    shadow: float = 30.0
+    prior: float = 0.05
+    penetration: float = 50.0
+    shadow: float = 15.0
     table: float = 300.0
-    self_collision: float = 100.0
+    self_collision: float = 50.0
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():

@@ -25,7 +25,7 @@ AT_OBJECT = 1
 NUM_OBSERVED, NUM_SHADOW = 256, 128
 SHADOW_DEPTHS = (0.007, 0.014)
 """Metres behind the observed surface, along the line of sight, at which the object is taken to go on."""
-NUM_NEAR = 64
+NUM_NEAR = 128
 """Points of a kind that are looked at around each hand; with more it takes longer and tells little else."""
 
 

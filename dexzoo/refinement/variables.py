@@ -29,9 +29,9 @@ class Region:
     Raises ValueError for what is not a positive number.
     """
 
-    wrist: float = 0.005
-    turn: float = 0.05
-    joint: float = 0.1
+    wrist: float = 0.01
+    turn: float = 0.1
+    joint: float = 0.2
     opening: float = 0.2
     squeeze: float = 0.3
 
