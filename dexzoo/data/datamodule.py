@@ -29,7 +29,7 @@ from dexzoo.resources import resource
 
 VIEWS_PER_FILE = 64
 """Views that are encoded and cached together; a grown set keeps the files of its old views."""
-GRASPS_PER_VIEW = 16
+GRASPS_PER_VIEW = 8
 """Grasps in a training batch that share a view, where encoding views is part of each step."""
 STATISTICS_VIEWS = 256
 """Training views that the image statistics are taken from, evenly spaced."""
