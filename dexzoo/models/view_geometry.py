@@ -72,20 +72,20 @@ def table_plane(images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view 
     Least squares over the object's pixels. The aimed camera stands upright, so the normal has no x component; points
     in one plane leave the rest open by a line, on which a faint pull to a camera 45 degrees high decides.
     """
-    depth, height = images.double().unbind(1)
-    seen = (depth > 0).double()
-    rays = _rays(images.shape[-1]).to(depth)
-    count = seen.sum((1, 2)).clamp_min(1)
-    y, z = rays[..., 1] * depth, rays[..., 2] * depth
-    mean_y, mean_z, mean_h = ((seen * x).sum((1, 2)) / count for x in (y, z, height))
-    dy, dz, dh = ((x - mean[:, None, None]) * seen for x, mean in ((y, mean_y), (z, mean_z), (height, mean_h)))
-    design = torch.stack((dy, dz), -1).flatten(1, 2)
+    depth, height = images.flatten(2).double().unbind(1)
+    rays = _rays(images.shape[-1]).to(depth).flatten(0, 1)
+    seen = (depth > 0).to(depth)
+    rows = torch.stack((seen, rays[:, 1] * depth, rays[:, 2] * depth, height * seen), 1)
+    sums = rows @ rows.mT  # of y, z and height, and of their products, over the object's pixels
+    count = sums[:, 0, 0].clamp_min(1)
+    mean = sums[:, 0, 1:] / count[:, None]
+    spread = sums[:, 1:, 1:] / count[:, None, None] - mean[:, :, None] * mean[:, None]
     pull = depth.new_full((2,), -(0.5**0.5))
-    normal_matrix = design.mT @ design / count[:, None, None] + _RIDGE * torch.eye(2).to(depth)
-    moment = (design.mT @ dh.flatten(1)[..., None]).squeeze(-1) / count[:, None] + _RIDGE * pull
+    normal_matrix = spread[:, :2, :2] + _RIDGE * torch.eye(2).to(depth)
+    moment = spread[:, :2, 2] + _RIDGE * pull
     normal = torch.linalg.solve(normal_matrix, moment)
     normal = normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    offset = mean_h - normal[:, 0] * mean_y - normal[:, 1] * mean_z
+    offset = mean[:, 2] - (normal * mean[:, :2]).sum(1)
     return torch.stack((torch.zeros_like(offset), normal[:, 0], normal[:, 1], offset), -1).to(images)
 
 
@@ -113,9 +113,8 @@ def cloud(geometry: ViewGeometry, count: int) -> Float[Tensor, "view {count} 6"]
 
 def _normals(points: Tensor, seen: Tensor, rays: Tensor) -> Tensor:
     """(view, 3, height, width) from central differences of the object's points, smoothed within the object."""
-    pad = SMOOTHING // 2
-    weight = F.avg_pool2d(seen, SMOOTHING, 1, pad)
-    smooth = F.avg_pool2d(points * seen, SMOOTHING, 1, pad) / weight.clamp_min(1e-6)
+    weight = _smooth(seen)
+    smooth = _smooth(points * seen) / weight.clamp_min(1e-6)
     smooth = F.pad(torch.where(weight > 0, smooth, points), (1, 1, 1, 1), mode="replicate")
     known = F.pad(weight > 0, (1, 1, 1, 1))
     middle = smooth[..., 1:-1, 1:-1]
@@ -129,10 +128,16 @@ def _normals(points: Tensor, seen: Tensor, rays: Tensor) -> Tensor:
     across = step((inside, slice(2, None)), (inside, slice(None, -2)))
     down = step((slice(2, None), inside), (slice(None, -2), inside))
     normal = torch.cross(across, down, dim=1)
-    length = normal.norm(dim=1, keepdim=True)
-    toward = -rays.movedim(-1, 0).expand_as(normal)  # where one pixel stands alone it faces the camera
-    normal = torch.where(length > 1e-10, normal / length.clamp_min(1e-10), F.normalize(toward, dim=1))
+    length = normal.square().sum(1, keepdim=True).sqrt()  # several times faster than norm over so few
+    toward = F.normalize(-rays, dim=-1).movedim(-1, 0).contiguous()  # where one pixel stands alone it faces the camera
+    normal = torch.where(length > 1e-10, normal / length.clamp_min(1e-10), toward)
     return torch.where((normal * toward).sum(1, keepdim=True) < 0, -normal, normal)
+
+
+def _smooth(maps: Tensor) -> Tensor:
+    """Means over a square window, zero beyond the image."""
+    pad = SMOOTHING // 2
+    return F.avg_pool2d(F.avg_pool2d(maps, (SMOOTHING, 1), 1, (pad, 0)), (1, SMOOTHING), 1, (0, pad))
 
 
 @lru_cache(maxsize=4)
