@@ -207,6 +207,28 @@ def test_nothing_changes_without_steps(can_view: Observation, grasps: Grasps, op
     assert torch.equal(result.score_after, result.score_before)
 
 
+@pytest.mark.parametrize("asked", [True, False])
+def test_a_way_into_the_table_is_not_accepted(can_view: Observation, grasps: Grasps, hand: Hand, asked: bool) -> None:
+    """The evaluator wants the hand lower, by more than there is room for; the climb itself hardly minds the table."""
+    given = lowered(grasps, can_view, hand, -0.005)
+    down = torch.tensor(can_view.aimed().T_world_camera[2, :3], dtype=torch.float32)
+    low = Known(lambda w: -1000 * (w[:, GRIP, :3] @ down))
+    result = refine(given, can_view, low, weights=replace(NOTHING, table=1e-9 if asked else 0.0))
+    way = slice(0, GRIP + 1)
+
+    def lowest(grasps: Grasps) -> Tensor:
+        links = grasps.wrist_pose[:, way, None] @ hand.forward_kinematics(grasps.joints[:, way])
+        return hand.clearance(links, torch.tensor([0.0, 0, 1, 0])).amin((-1, -2))
+
+    assert (lowest(given) > 0.004).all()
+    if asked:
+        assert not result.accepted.all()
+        assert (lowest(result.grasps) > 0.0).all()
+    else:
+        assert result.accepted.all()
+        assert (lowest(result.grasps) < 0.0).any()
+
+
 def test_what_is_not_accepted_is_handed_back_itself(can_view: Observation, grasps: Grasps) -> None:
     """The gradient points away from what is better."""
     result = refine(grasps, can_view, Known(lambda w: 2 * nearness(w).detach() - nearness(w)), weights=NOTHING)

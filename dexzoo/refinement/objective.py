@@ -14,7 +14,7 @@ from dexzoo.camera import Observation
 from dexzoo.generators.density import GraspDensity
 from dexzoo.hand import Hand
 from dexzoo.models.evaluator import PreparedView
-from dexzoo.refinement.penalties import AT_OBJECT, Posed, Prior, Surroundings
+from dexzoo.refinement.penalties import AT_OBJECT, WAY, Posed, Prior, Surroundings
 
 Terms = dict[str, Float[Tensor, " grasp"]]
 """log_odds, and the terms of `Weights` that are asked for, by name."""
@@ -84,6 +84,14 @@ class Objective:
             return found
 
         return terms
+
+    @torch.no_grad()
+    def lacks(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
+        """The term "table" on the whole way to the grip, with all that is near; 0 where it has no weight."""
+        if not self.weights.table:
+            return waypoints.new_zeros(len(waypoints))
+        every = self.surroundings.others[None, None]
+        return torch.cat([Posed(self.hand, part, WAY).table(every) for part in waypoints.split(8)])
 
     def value(self, terms: Terms) -> Float[Tensor, " grasp"]:
         """What the terms add up to."""

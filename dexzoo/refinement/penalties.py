@@ -20,6 +20,7 @@ from dexzoo.hand import Hand
 
 MOMENTS = [PREGRASP, GRIP // 2, GRIP]
 """The waypoints at which the hand is looked at; beyond the grip it is meant to press."""
+WAY = list(range(PREGRASP, GRIP + 1))
 AT_OBJECT = 1
 """The first of these at which it can be in the object."""
 NUM_OBSERVED, NUM_SHADOW = 256, 128
@@ -53,10 +54,10 @@ def _evenly(points: Tensor, num: int) -> Tensor:
 
 
 class Posed:
-    """Hands at `MOMENTS`: wrist (grasp, moment, 4, 4) in the world, links (grasp, moment, link, 4, 4) in the palm."""
+    """Hands at some waypoints: wrist (grasp, moment, 4, 4) in the world, links (grasp, moment, link, 4, 4) in the palm."""
 
-    def __init__(self, hand: Hand, waypoints: Float[Tensor, "grasp 10 28"]) -> None:
-        way = waypoints[:, MOMENTS]
+    def __init__(self, hand: Hand, waypoints: Float[Tensor, "grasp 10 28"], moments: list[int] = MOMENTS) -> None:
+        way = waypoints[:, moments]
         self.hand = hand
         self.wrist = pose_matrix(way[..., POSITION], way[..., QUATERNION])
         self.links = hand.forward_kinematics(way[..., JOINTS])
@@ -76,7 +77,7 @@ class Posed:
         """Metres that the deepest point lies in each link, summed over links and moments."""
         return (-self.distance(near, AT_OBJECT).amin(-1)).clamp_min(0).sum((-1, -2))
 
-    def table(self, near: Float[Tensor, "grasp moment near 3"]) -> Float[Tensor, " grasp"]:
+    def table(self, near: Float[Tensor, "#grasp #moment near 3"]) -> Float[Tensor, " grasp"]:
         """Metres that each link lacks of its clearance from the table and what stands on it, summed likewise."""
         # the third row of a pose is the table's plane in the palm frame
         clearance = self.hand.clearance(self.links, self.wrist[..., 2, :])
