@@ -82,8 +82,8 @@ def refine(
     grasps: in the frame of the depth image's camera, or of its world. depth: (height, width) metres with its camera, or
     an Observation. evaluator: what guides: a model, or what `dexzoo.load` takes.
     judge: another such, which does not guide, but must find the log-odds of a refined grasp higher by more than
-    `margin` for it to be accepted. Without one, it is enough that the objective rises and, where
-    the table has a weight, that the way to the grip keeps as clear of it as before.
+    `margin` for it to be accepted. Without one, it is enough that the objective rises and that, where the table has a
+    weight, the way to the grip keeps as clear of it as before.
     optimiser, num_steps, step_size: how many states are evaluated besides the first of each half; a step moves a number
     by about `step_size` of its half of the trust region. The first half of the steps moves the wrist, the second the
     fingers.

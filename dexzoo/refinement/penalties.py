@@ -54,7 +54,7 @@ def _evenly(points: Tensor, num: int) -> Tensor:
 
 
 class Posed:
-    """Hands at some waypoints: wrist (grasp, moment, 4, 4) in the world, links (grasp, moment, link, 4, 4) in the palm."""
+    """Hands at some waypoints: wrist (grasp, moment, 4, 4) in the world, links (..., link, 4, 4) in the palm."""
 
     def __init__(self, hand: Hand, waypoints: Float[Tensor, "grasp 10 28"], moments: list[int] = MOMENTS) -> None:
         way = waypoints[:, moments]
