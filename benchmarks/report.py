@@ -64,7 +64,7 @@ def counts() -> str:
     objects = ", ".join(f"{count} {split}" for split, count in data["objects"].items())
     lines = [
         f"{data['grasps']:,} grasps in {data['scenes']:,} scenes with {data['views']:,} views, {data['megabytes']:.0f} "
-        f"MB; objects: {objects}. {percent(data['hold'])} hold; {data['collided']} hit the table or a block, "
+        f"MB; objects: {objects}. {percent(data['hold'])} hold; {data['collided']:,} hit the table or a block, "
         f"{data['starts_inside']} would start inside the object, {data['unstable']} were unstable. "
         f"{data['duplicates']} are duplicates, {data['outside_limits']} leave the limits of the joints.\n",
         f"Scenes tried and left out: {skipped(data['skipped'])}. With theirs, {percent(data['hold_of_all_generated'])} "

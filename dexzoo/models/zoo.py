@@ -24,7 +24,6 @@ _MODELS = {
     "em3": "dexzoo.models.em3.EM3",
     "ffh": "dexzoo.models.ffh.FFH",
     "em_fk": "dexzoo.models.em_fk.EMFK",
-    "em_fk_judge": "dexzoo.models.em_fk.EMFK",  # from another seed, to judge what em_fk has refined
     "ensemble": "dexzoo.models.ensemble.Ensemble",
 }
 _PICKLE_SUFFIXES = {".ckpt", ".pt", ".pth", ".pkl", ".pickle", ".bin"}
