@@ -68,7 +68,10 @@ def count(data: GraspSet, manifest: dict) -> dict[str, object]:
         return {"grasps": int(chosen.sum()), "hold": float(data.success[chosen].mean())}
 
     every = np.ones_like(generated)
-    ranks = {f"{low + 1} to {high}": generated & (low <= rank) & (rank < high) for low, high in pairwise(RANKS)}
+    ranks = {
+        f"{low + 1} to {high}" if high > low + 1 else str(high): generated & (low <= rank) & (rank < high)
+        for low, high in pairwise(RANKS)
+    }
     return {
         "configuration": manifest["configuration"],
         "scale": SCALE_RANGE,

@@ -1,4 +1,4 @@
-"""Ship a run's weights: assets/checkpoints/NAME.safetensors and its card, NAME being the architecture's unless given.
+"""Ship a run's weights: assets/checkpoints/NAME.safetensors and its card, NAME being the architecture's.
 
 python benchmarks/release.py runs/em2-adamw/version_0 --limits "What its users should know." "And this."
 Half precision is kept where no figure on the test objects differs by more than 0.1 point from those of the run's best
@@ -44,22 +44,20 @@ LIMITS = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="a folder that fit has written, or a .safetensors file")
-    parser.add_argument("--name", help="of the model among those that `dexzoo.load` knows; default: its architecture's")
     parser.add_argument("--limits", nargs="*", help="sentences, besides those that hold for all; default: as they were")
     parser.add_argument("--data", default="assets/grasps")
     parser.add_argument("--folder", type=Path, default=resource("checkpoints"))
     options = parser.parse_args()
-    sys.stdout.write(f"{release(options.run, options.folder, options.data, options.limits, options.name)}\n")
+    sys.stdout.write(f"{release(options.run, options.folder, options.data, options.limits)}\n")
 
 
-def release(run: Path, folder: Path, data: str, limits: list[str] | None = None, name: str | None = None) -> Path:
+def release(run: Path, folder: Path, data: str, limits: list[str] | None = None) -> Path:
     """Write weights and card into the folder; returns the path of the weights.
 
-    limits: of this model, in its card after those that hold for all; None leaves what the card has. name: of the files,
-    by default the architecture's.
+    limits: of this model, in its card after those that hold for all; None leaves what the card has.
     """
     model, weights = dexzoo.load(run), run if run.is_file() else next(run.glob("*.safetensors"))
-    path, full = folder / f"{name or model.architecture}.safetensors", full_precision(run, model)
+    path, full = folder / f"{model.architecture}.safetensors", full_precision(run, model)
     card = json.loads(weights.with_suffix(".json").read_text())
     if limits is not None or "limits" not in card:
         card["limits"] = [*LIMITS, *(limits or [])]

@@ -21,7 +21,11 @@ from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
 
 GENERATED = "generated"
-ALL, OTHERS, UNDISTURBED = "the rate of all its trials", "the rate of its other trials", "its trial as it is"
+ALL, OTHERS, UNDISTURBED = (
+    "the rate of all its trials",
+    "the rate of its other trials",
+    "its one trial without disturbance",
+)
 FIGURES = ("accuracy", "auroc", "average_precision", "brier", "calibration_error")
 
 

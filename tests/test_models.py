@@ -99,6 +99,24 @@ def test_views_and_grasps_do_not_mix(model: GraspEvaluator, data: GraspDataModul
     torch.testing.assert_close(whole[1, 2], one[0, 0], atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("paired", [[2, 0, 1, 0, 2, 2], [0, 0, 0], [1, 0]])
+@pytest.mark.parametrize("encoded", [True, False])
+def test_a_batch_is_its_grasps_one_by_one(
+    model: GraspEvaluator, data: GraspDataModule, paired: list[int], encoded: bool
+) -> None:
+    images = torch.stack([data.source.observation(view).image() for view in range(max(paired) + 1)])
+    view, grasps = torch.tensor(paired), data.waypoints[: len(paired), None]
+    with torch.no_grad():
+        scene = model.encode(images)
+        batch = evaluator.Batch(scene if encoded else images, view, grasps, torch.zeros(len(view)), view)
+        alone = [
+            model.logit({name: value[v, None] for name, value in scene.items()}, grasp[None]).item()
+            for v, grasp in zip(paired, grasps, strict=True)
+        ]
+        found = model.batch_logit(batch)
+    torch.testing.assert_close(found, torch.tensor(alone), atol=1e-4, rtol=1e-4)
+
+
 def test_logits_follow_every_part_of_a_grasp(model: GraspEvaluator, data: GraspDataModule) -> None:
     scene = model.encode(data.source.observation(0).image()[None])
     waypoints = data.waypoints[None, :3].clone().requires_grad_()

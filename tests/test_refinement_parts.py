@@ -132,7 +132,7 @@ def test_penetration_is_that_of_all_points(
     """By every observed point and every link by itself, in the world frame, in float64."""
     way = sunk(world, can_view)
     found = Posed(hand, way).penetration(Posed(hand, way).nearest(around.observed, AT_OBJECT))
-    links = poses(hand, way, MOMENTS[AT_OBJECT:])
+    links = poses(hand, way, list(MOMENTS[AT_OBJECT:]))
     expected = torch.zeros(len(way), dtype=torch.float64)
     for grasp in range(len(way)):
         for moment in range(links.shape[1]):
@@ -178,7 +178,7 @@ def test_the_table_is_what_each_link_lacks_of_its_clearance(world: Tensor, hand:
         :, None
     ].float()
     found = Posed(hand, way).table(torch.zeros(len(way), len(MOMENTS), 0, 3))
-    height = hand.clearance(poses(hand, way, MOMENTS), torch.tensor([0.0, 0, 1, 0]).double())
+    height = hand.clearance(poses(hand, way, list(MOMENTS)), torch.tensor([0.0, 0, 1, 0]).double())
     torch.testing.assert_close(found.double(), (0.002 - height).clamp_min(0).sum((-1, -2)), atol=1e-5, rtol=1e-4)
     assert float(found.min()) > 0.006 - 1e-5
     point = way[:, GRIP, None, None, :3].expand(-1, len(MOMENTS), 1, 3)  # something stands where the palm is

@@ -15,17 +15,17 @@ from dexzoo.models.zoo import load
 class Ensemble(GraspEvaluator):
     """Members that were trained one by one; nothing here is trained but the calibration.
 
-    members: what `dexzoo.load` takes: names of models, files or folders; em2 alone where none are given. They are
+    members: what `dexzoo.load` takes: names of models, files or folders; em_fk alone where none are given. They are
     loaded, not copied: a saved ensemble holds their names and its own calibration, and needs them where they were.
 
-    >>> Ensemble(members=["em2", "runs/em_fk/version_0"]).save("runs/ensemble")  # doctest: +SKIP
+    >>> Ensemble(members=["em_fk", "runs/em_fk/version_0"]).save("runs/ensemble")  # doctest: +SKIP
     """
 
     architecture: ClassVar[str] = "ensemble"
 
     def __init__(self, members: list[str] | None = None, **training: Unpack[TrainingOptions]) -> None:
         super().__init__(**training)
-        self.members = ["em2"] if members is None else members
+        self.members = ["em_fk"] if members is None else members
         if not self.members:
             raise ValueError("an ensemble needs at least one member")
         # in a tuple, out of the way of state_dict, since each has its own file; they follow what they are given

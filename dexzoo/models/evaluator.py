@@ -38,7 +38,8 @@ Scene = dict[str, Tensor]
 class Batch(NamedTuple):
     """Grasps with the view each is paired with.
 
-    views: the views that occur, encoded, or, where the encoder is trained, as images (view, 2, 224, 224).
+    views: the views that occur, encoded, or, where the encoder is trained, as images (view, 2, 224, 224); each of them
+    is paired with a grasp.
     view: (batch,) which of them each grasp is paired with.
     grasps: (batch, 1, 10, 28) waypoints in the frame of the view's aimed camera.
     success: (batch,) 0 or 1. scene_index: (batch,) which scene of the set.
@@ -136,7 +137,10 @@ class GraspEvaluator(LightningModule):
         raise NotImplementedError
 
     def logit(self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]) -> Float[Tensor, "view grasp"]:
-        """Log-odds of success, differentiable in the grasps, which are in the frame of the view's aimed camera."""
+        """Log-odds of success, differentiable in the grasps, which are in the frame of the view's aimed camera.
+
+        Each grasp for itself: what is handed in together differs from call to call.
+        """
         raise NotImplementedError
 
     def logit_and_spread(

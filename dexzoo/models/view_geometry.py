@@ -128,7 +128,7 @@ def _normals(points: Tensor, seen: Tensor, rays: Tensor) -> Tensor:
     across = step((inside, slice(2, None)), (inside, slice(None, -2)))
     down = step((slice(2, None), inside), (slice(None, -2), inside))
     normal = torch.cross(across, down, dim=1)
-    length = normal.square().sum(1, keepdim=True).sqrt()  # several times faster than norm over so few
+    length = normal.square().sum(1, keepdim=True).sqrt()  # several times faster than norm, over three numbers
     toward = F.normalize(-rays, dim=-1).movedim(-1, 0).contiguous()  # where one pixel stands alone it faces the camera
     normal = torch.where(length > 1e-10, normal / length.clamp_min(1e-10), toward)
     return torch.where((normal * toward).sum(1, keepdim=True) < 0, -normal, normal)

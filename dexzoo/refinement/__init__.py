@@ -1,6 +1,6 @@
 """Refinement: better grasps near those that were proposed, judged by evaluators alone; the simulator is not asked.
 
-method.py      `refine`: propose by climbing, accept if a second evaluator agrees
+method.py      `refine`: propose by climbing, accept what rose, and what a second evaluator agrees to
 climb.py       one climb: variables, objective and optimiser brought together, chunk by chunk
 variables.py   what may be moved, within the trust region by construction
 objective.py   what is climbed: log-odds, prior, penalties, and their weights

@@ -1,4 +1,4 @@
-"""Refinement: propose by climbing an objective, accept if an evaluator that did not guide the climb agrees."""
+"""Refinement: propose by climbing an objective, accept if it rose, and another evaluator, if asked, agrees."""
 
 from __future__ import annotations
 
@@ -26,10 +26,7 @@ from dexzoo.refinement.variables import Region
 MIN_RISE = 1e-4
 """Log-odds by which the objective must rise; less may be rounding."""
 MAX_LACK = 0.001
-"""Metres that links, in sum, may come nearer to the table and what stands on it than their clearance, on the whole way.
-
-The climb looks at three waypoints only.
-"""
+"""Metres by which what links lack of their clearance, summed over links and waypoints to the grip, may grow."""
 MAX_DISTANCE = 0.3
 """Metres between palm and object beyond which no hand grasps: the grasps are in another frame than they say."""
 
@@ -82,8 +79,8 @@ def refine(
     grasps: in the frame of the depth image's camera, or of its world. depth: (height, width) metres with its camera, or
     an Observation. evaluator: what guides: a model, or what `dexzoo.load` takes.
     judge: another such, which does not guide, but must find the log-odds of a refined grasp higher by more than
-    `margin` for it to be accepted. Without one, it is enough that the objective rises and that, where the table has a
-    weight, the way to the grip keeps as clear of it as before.
+    `margin` for it to be accepted. With or without one, the objective must rise, and, where the table has a weight, the
+    whole way to the grip must lack no more of its clearance than before.
     optimiser, num_steps, step_size: how many states are evaluated besides the first of each half; a step moves a number
     by about `step_size` of its half of the trust region. The first half of the steps moves the wrist, the second the
     fingers.

@@ -16,6 +16,8 @@ from dexzoo.hand import Hand
 from dexzoo.models.evaluator import PreparedView
 from dexzoo.refinement.penalties import AT_OBJECT, WAY, Posed, Prior, Surroundings
 
+_TOGETHER = 8
+"""Grasps whose whole ways are looked at together, with all points near them; bounds memory."""
 Terms = dict[str, Float[Tensor, " grasp"]]
 """log_odds, and the terms of `Weights` that are asked for, by name."""
 
@@ -91,7 +93,7 @@ class Objective:
         if not self.weights.table:
             return waypoints.new_zeros(len(waypoints))
         every = self.surroundings.others[None, None]
-        return torch.cat([Posed(self.hand, part, WAY).table(every) for part in waypoints.split(8)])
+        return torch.cat([Posed(self.hand, part, WAY).table(every) for part in waypoints.split(_TOGETHER)])
 
     def value(self, terms: Terms) -> Float[Tensor, " grasp"]:
         """What the terms add up to."""

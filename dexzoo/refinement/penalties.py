@@ -18,16 +18,17 @@ from dexzoo.generators.surroundings import obstacles, underneath
 from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, in_frame, pose_matrix
 from dexzoo.hand import Hand
 
-MOMENTS = [PREGRASP, GRIP // 2, GRIP]
+MOMENTS = (PREGRASP, GRIP // 2, GRIP)
 """The waypoints at which the hand is looked at; beyond the grip it is meant to press."""
-WAY = list(range(PREGRASP, GRIP + 1))
+WAY = tuple(range(PREGRASP, GRIP + 1))
+"""The waypoints that acceptance looks at."""
 AT_OBJECT = 1
-"""The first of these at which it can be in the object."""
+"""The first of `MOMENTS`, by its place among them, at which it can be in the object."""
 NUM_OBSERVED, NUM_SHADOW = 256, 128
 SHADOW_DEPTHS = (0.007, 0.014)
 """Metres behind the observed surface, along the line of sight, at which the object is taken to go on."""
 NUM_NEAR = 128
-"""Points of a kind that are looked at around each hand; with more it takes longer and tells little else."""
+"""Points of a kind that are looked at around each hand: enough for what is near to stay so in the trust region."""
 
 
 class Surroundings:
@@ -56,8 +57,8 @@ def _evenly(points: Tensor, num: int) -> Tensor:
 class Posed:
     """Hands at some waypoints: wrist (grasp, moment, 4, 4) in the world, links (..., link, 4, 4) in the palm."""
 
-    def __init__(self, hand: Hand, waypoints: Float[Tensor, "grasp 10 28"], moments: list[int] = MOMENTS) -> None:
-        way = waypoints[:, moments]
+    def __init__(self, hand: Hand, waypoints: Float[Tensor, "grasp 10 28"], moments: tuple[int, ...] = MOMENTS) -> None:
+        way = waypoints[:, list(moments)]
         self.hand = hand
         self.wrist = pose_matrix(way[..., POSITION], way[..., QUATERNION])
         self.links = hand.forward_kinematics(way[..., JOINTS])

@@ -46,7 +46,7 @@ GROUPS = {"A": Group(2, 0), "B": Group(2, NUM_WAYPOINTS - 3), "C": Group(20, NUM
 def ascend(
     grasps: Grasps,
     depth: NDArray[np.floating] | Observation,
-    evaluator: str | GraspEvaluator = "em2",
+    evaluator: str | GraspEvaluator = "em_fk",
     camera: Camera | None = None,
     group: str = "A",
     step_size: float = STEP_SIZE,
