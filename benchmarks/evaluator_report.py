@@ -166,32 +166,3 @@ def training(found: dict[str, Any]) -> str:
         f"{learning['ratio_in_the_first_epoch']:.0f} times in the first epoch, which encodes all views; scoring "
         f"grasps on one view is {scoring['ratio']:.0f} times faster than pair by pair.\n\n"
     ) + table(("", "1,000 grasps with", "processor seconds"), rows)
-
-
-def first_meshes() -> str:
-    """One ranking of grasps on objects from elsewhere, until the comparison has been run on them."""
-    if (RESULTS / "evaluators_meshes.json").exists():
-        return ""
-    meshes = read("meshes")
-    parts = [
-        f"## Meshes from elsewhere\n\nScanned and CAD household objects that are no part of "
-        "dexzoo, 50 grasps each from one view, 0.2 kg, friction 0.7. At least one grasp holds for "
-        f"{meshes['objects_with_a_grasp_that_holds']} of {len(meshes['objects'])}.\n",
-        table(
-            ("object", "grasps", "hold", "hit the table", "first that holds in em2's order", "in the generator's"),
-            [
-                (
-                    row["object"],
-                    row["grasps"],
-                    row["hold"],
-                    row["collided"],
-                    row["first_that_holds_by_evaluator"] or "none",
-                    row["first_that_holds_by_generator"] or "none",
-                )
-                if "grasps" in row
-                else (row["object"], row["error"], "", "", "", "")
-                for row in meshes["objects"]
-            ],
-        ),
-    ]
-    return "\n".join(parts)

@@ -5,10 +5,10 @@ python benchmarks/report.py
 
 from typing import Any
 
-from evaluator_report import evaluators, first_meshes
-from generator_report import generator, points
+from evaluator_report import evaluators
+from generator_report import generator, points, rate
 from refine_report import refinement
-from tables import RESULTS, ROOT, percent, read, span, table, with_figures
+from tables import ROOT, percent, read, span, table, with_figures
 
 
 def main() -> None:
@@ -34,6 +34,8 @@ def summary() -> str:
     def of_hundred(figure: dict[str, Any]) -> str:
         return f"{percent(figure['value'])} ({span(figure['interval'], 100, 1)})"
 
+    refined = read("refinement")
+    method = refined["variants"]["method"]
     rows = [
         (
             f"in {generated['scenes']} scenes in which at least one grasp holds: success of all of the generator's",
@@ -43,20 +45,14 @@ def summary() -> str:
         ("in the order of `em_fk`", of_hundred(best["top1"])),
         ("accuracy of `em_fk` on all of them", of_hundred(best["accuracy"])),
         ("its AUROC", f"{best['auroc']['value']:.3f} ({span(best['auroc']['interval'])})"),
-        refined_row(),
+        (
+            f"in {method['scenes']} scenes, success of all of the generator's grasps, {method['grasps']:,}",
+            rate(method["success_before"]),
+        ),
+        ("the same grasps refined", rate(method["success_after"])),
+        ("change", points(method["change"])),
     ]
     return table(("what, on test objects", "figure (95 % interval over scenes)"), rows)
-
-
-def refined_row() -> tuple[str, str]:
-    """What refinement does to the success of the generator's grasps."""
-    if (RESULTS / "refinement.json").exists():
-        found = read("refinement")
-        _, method = next(iter(found["variants"].items()))
-        return f"change of success by refinement guided by `{found['evaluator']}`", points(method["change"])
-    grip = read("refine")["groups"]["grip: 20 steps, wrist and 15 joints"]
-    change = f"{100 * grip['change']:+.1f} points ({span(grip['change_interval'], 100, 1)})"
-    return "change of success by refinement guided by `em2`, on the first grasp set", change
 
 
 def counts() -> str:
@@ -226,51 +222,13 @@ def labels(found: dict[str, Any]) -> str:
     )
 
 
-def first_refinement() -> str:
-    """What refinement did before it was rebuilt, until the benchmark has been run anew."""
-    if (RESULTS / "refinement.json").exists():
-        return "## Refinement\n\nIts own page: [refinement.md](refinement.md).\n"
-    refine = read("refine")
-    parts = [
-        f"## Refinement\n\n`benchmarks/refine.py`; guided by `{refine['evaluator']}`, {refine['grasps']} grasps in "
-        f"{refine['scenes']} scenes of test objects, of which {percent(refine['success_before'])} hold as generated; "
-        "the same trials before and after.\n",
-        table(
-            (
-                "variables",
-                "hold after",
-                "change, points",
-                "interval",
-                "success to fail",
-                "fail to success",
-                "hit the table",
-                "mean rise of the score",
-            ),
-            [
-                (
-                    name,
-                    percent(row["success_after"]),
-                    f"{100 * row['change']:+.1f}",
-                    span(row["change_interval"], 100, 1),
-                    row["success_to_fail"],
-                    row["fail_to_success"],
-                    row["collided"],
-                    f"{row['mean_rise_of_score']:+.3f}",
-                )
-                for name, row in refine["groups"].items()
-            ],
-        ),
-    ]
-    return "\n".join(parts)
-
-
 def page() -> str:
     kinematics, collect = read("kinematics"), read("collect")
     parts = [
         "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
         "bootstrap over scenes.\n",
         evaluators(),
-        first_refinement(),
+        "## Refinement\n\nIts own page: [refinement.md](refinement.md).\n",
         "## Labels\n\n" + labels(read("simulator")),
         f"## The hand\n\n`benchmarks/kinematics.py`, {kinematics['threads']} threads; all links of "
         f"{kinematics['kinematics']['batch']:,} postures, against pytorch_kinematics "
@@ -315,7 +273,6 @@ def page() -> str:
         "batches of "
         + ", ".join(f"{size}: {value:,.0f}" for size, value in collect["grasps_loaded_per_second"].items())
         + ".\n",
-        first_meshes(),
     ]
     return "\n".join(parts)
 
