@@ -53,10 +53,8 @@ def repeated(found: dict[str, Any]) -> str:
         [
             (
                 name,
-                *(
-                    f"{scale * row[key]['value']:.{digits}f} ({span(row[key]['interval'], scale, digits)})"
-                    for key, scale, digits in (("accuracy", 100, 1), ("auroc", 1, 3), ("brier", 1, 3))
-                ),
+                valued(row["accuracy"], 100, 1),
+                *(valued(row[key], 1, 3) for key in ("auroc", "brier")),
                 f"{row['calibration_error']['value']:.3f}",
             )
             for name, row in found["rows"].items()
@@ -148,8 +146,11 @@ def figure(row: dict[str, Any], key: str, source: str, name: str, scale: float, 
     found = row.get(key, {}).get(source)
     if found is None:
         return ""
-    value, sign = scale * found[name]["value"], "+" if key == "change" else ""
-    return f"{value:{sign}.{digits}f} ({span(found[name]['interval'], scale, digits)})"
+    return valued(found[name], scale, digits, "+" if key == "change" else "")
+
+
+def valued(found: dict[str, Any], scale: float, digits: int, sign: str = "") -> str:
+    return f"{scale * found['value']:{sign}.{digits}f} ({span(found['interval'], scale, digits)})"
 
 
 def training(found: dict[str, Any]) -> str:

@@ -9,14 +9,15 @@ under the scene's own mass and friction, whose outcomes evaluators learn from, a
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dexzoo.comparison.compare import load_models
-from dexzoo.comparison.figures import draw_scenes, figures, with_interval
-from dexzoo.comparison.scores import Labels, Scores, model_scores, read_labels
+from dexzoo.comparison.figures import draw_scenes, figures_with_intervals
+from dexzoo.comparison.scores import Scores, model_scores, read_labels, rows_of
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
 
@@ -47,27 +48,26 @@ def foreseen(models: list[str], data: GraspDataModule, split: str) -> dict[str, 
     if labels is None:
         raise ValueError(f"grasp set {data.folder} has no generated grasps in its {split} split")
     grasp_set = data.source
-    rows = np.flatnonzero((grasp_set.grasp_split == SPLITS.index(split)) & (grasp_set.source == GENERATED))
-    rate = grasp_set.grasps["success_rate"].to_numpy()[rows]
+    rate = grasp_set.grasps["success_rate"].to_numpy()[rows_of(data, split, GENERATED)]
     if np.isnan(rate).any():
         raise ValueError(f"grasp set {data.folder} has grasps that were tried once; collect it with --trials 5")
     trials = int(grasp_set.scenes["trials"][0].as_py())
     held = np.rint(rate * trials).astype(int)
     success = np.arange(trials) < held[:, None]  # (grasp, trial), in no order
-    of_trials = Labels(
-        success.ravel(),
-        labels.scene.repeat(trials),
-        labels.objects,
-        labels.category,
-        labels.log_likelihood.repeat(trials),
+    of_trials = replace(
+        labels,
+        success=success.ravel(),
+        scene=labels.scene.repeat(trials),
+        log_likelihood=labels.log_likelihood.repeat(trials),
     )
     rest = (held[:, None] - success) / (trials - 1)
     known = {ALL: rate.repeat(trials), OTHERS: rest.ravel(), UNDISTURBED: labels.success.repeat(trials)}
     scores = {name: Scores(value.astype(np.float32), 0.5, value.astype(np.float32)) for name, value in known.items()}
     for name, model in load_models(models).items():
-        found = model_scores(model, data.dataset(split, model, [GENERATED]), name)
-        scores[name] = found[np.arange(len(rate)).repeat(trials)]
-    weights = np.concatenate((np.ones((1, labels.num_scenes)), draw_scenes(labels.num_scenes, seed=0)))
+        once = model_scores(model, data.dataset(split, model, [GENERATED]), name)
+        scores[name] = once[np.arange(len(rate)).repeat(trials)]
+    draws = draw_scenes(labels.num_scenes, seed=0)
+    found = {name: figures_with_intervals(of_trials, score, draws) for name, score in scores.items()}
     return {
         "data": grasp_set.sha256,
         "grasps": len(rate),
@@ -77,13 +77,8 @@ def foreseen(models: list[str], data: GraspDataModule, split: str) -> dict[str, 
         "hold_as_they_are": float(labels.success.mean()),
         "mean_rate": float(rate.mean()),
         "always_the_same": float(np.isin(held, (0, trials)).mean()),
-        "rows": {name: row(of_trials, score, weights) for name, score in scores.items()},
+        "rows": {name: {key: row[key] for key in FIGURES} for name, row in found.items()},
     }
-
-
-def row(labels: Labels, scores: Scores, weights: np.ndarray) -> dict[str, Any]:
-    found = figures(labels, scores, weights)
-    return {name: with_interval(found[name][:1], found[name][1:]) for name in FIGURES}
 
 
 if __name__ == "__main__":

@@ -5,10 +5,10 @@ python benchmarks/report.py
 
 from typing import Any
 
-from evaluator_report import evaluators
+from evaluator_report import evaluators, valued
 from generator_report import generator, points, rate
 from refine_report import refinement
-from tables import ROOT, percent, read, span, table, with_figures
+from tables import ROOT, percent, read, table, with_figures
 
 
 def main() -> None:
@@ -30,12 +30,11 @@ def main() -> None:
 def summary() -> str:
     generated = read("comparison")["sources"]["generated"]
     best, gm = (generated["rows"][name]["figures"] for name in ("em_fk", "gm"))
+    method = read("refinement")["variants"]["method"]
 
     def of_hundred(figure: dict[str, Any]) -> str:
-        return f"{percent(figure['value'])} ({span(figure['interval'], 100, 1)})"
+        return rate(figure | {"rate": figure["value"]})
 
-    refined = read("refinement")
-    method = refined["variants"]["method"]
     rows = [
         (
             f"in {generated['scenes']} scenes in which at least one grasp holds: success of all of the generator's",
@@ -44,7 +43,7 @@ def summary() -> str:
         ("success of the first of each scene in the generator's own order", of_hundred(gm["top1"])),
         ("in the order of `em_fk`", of_hundred(best["top1"])),
         ("accuracy of `em_fk` on all of them", of_hundred(best["accuracy"])),
-        ("its AUROC", f"{best['auroc']['value']:.3f} ({span(best['auroc']['interval'])})"),
+        ("its AUROC", valued(best["auroc"], 1, 3)),
         (
             f"in {method['scenes']} scenes, success of all of the generator's grasps, {method['grasps']:,}",
             rate(method["success_before"]),

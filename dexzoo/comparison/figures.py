@@ -46,16 +46,21 @@ def describe(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
     the grasps, their mean probability and their success rate. by_category: grasps, scenes and a few figures of each.
     """
     once = np.ones((1, labels.num_scenes))
-    value, replicates = figures(labels, scores, once), figures(labels, scores, draws)
     tenths = by_scene(SuccessByRank(), labels, scores).T
     return {
-        "figures": {name: with_interval(value[name], replicates[name]) for name in value},
+        "figures": figures_with_intervals(labels, scores, draws),
         "threshold": scores.threshold,
         "counts": counts(labels, scores),
         "by_rank": [with_interval(mean(tenth, once), mean(tenth, draws)) for tenth in tenths],
         "reliability": reliability(labels, scores),
         "by_category": {str(name): _of_category(name, labels, scores) for name in np.unique(labels.category)},
     }
+
+
+def figures_with_intervals(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
+    """Value and 95 % interval of every figure of a row, plain values."""
+    value, replicates = figures(labels, scores, np.ones((1, labels.num_scenes))), figures(labels, scores, draws)
+    return {name: with_interval(value[name], replicates[name]) for name in value}
 
 
 def figures(labels: Labels, scores: Scores, weights: Array) -> dict[str, Array]:

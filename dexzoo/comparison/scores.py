@@ -93,10 +93,14 @@ class Cost:
     threads: int
 
 
+def rows_of(data: GraspDataModule, split: str, source: str) -> NDArray[np.int64]:
+    """The rows of the table of grasps that a split has from one source, in the order of `data.dataset`."""
+    return np.flatnonzero((data.source.grasp_split == SPLITS.index(split)) & (data.source.source == source))
+
+
 def read_labels(data: GraspDataModule, split: str, source: str) -> Labels | None:
     """The grasps of a split from one source, in the order of `data.dataset`; None where there are none."""
-    grasp_set = data.source
-    rows = np.flatnonzero((grasp_set.grasp_split == SPLITS.index(split)) & (grasp_set.source == source))
+    grasp_set, rows = data.source, rows_of(data, split, source)
     if not len(rows):
         return None
     shown, scene = np.unique(grasp_set.grasp_scene[rows], return_inverse=True)
