@@ -23,6 +23,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.models.encoders import has_bfloat16
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load, load_weights
 from dexzoo.resources import resource
@@ -78,6 +79,15 @@ class CommandLine(LightningCLI):
         """The subcommands, with those of the trainer's arguments that this command line settles by itself."""
         settled = {"weights_only", "verbose", "return_predictions"}
         return {name: skipped | settled for name, skipped in LightningCLI.subcommands().items()}
+
+    def before_instantiate_classes(self) -> None:
+        """Train in float32 where bfloat16 would be slow."""
+        trainer = self._get(self.config, "trainer")
+        chosen = trainer.accelerator
+        on_processor = chosen == "cpu" or (chosen == "auto" and not torch.accelerator.is_available())
+        if on_processor and trainer.precision == "bf16-mixed" and not has_bfloat16(torch.device("cpu")):
+            _log.warning("this processor has no instructions for bfloat16: precision 32-true in place of it")
+            trainer.precision = "32-true"
 
     def _parse_ckpt_path(self) -> None:
         """Overrides Lightning, which would let a checkpoint's hyper-parameters beat the given configuration."""

@@ -99,6 +99,20 @@ def drawn_from(success: torch.Tensor, scene: torch.Tensor) -> GraspDataset:
     )
 
 
+@pytest.mark.parametrize(("has", "precision"), [(True, "bf16-mixed"), (False, "32-true")])
+def test_bfloat16_only_where_the_processor_has_it(
+    arguments: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    has: bool,
+    precision: str,
+) -> None:
+    monkeypatch.setattr(training, "has_bfloat16", lambda device: has)
+    run = fit([*arguments, "--trainer.max_steps=1", "--trainer.val_check_interval=1"], capsys)
+    card = json.loads((run / "em2.json").read_text())
+    assert card["config"]["trainer"]["precision"] == precision
+
+
 def test_balanced_batches_are_balanced_and_go_on() -> None:
     rng = np.random.default_rng(0)
     scene = torch.tensor(rng.integers(0, 50, 2000))
