@@ -27,22 +27,13 @@ from dexzoo import training
 from dexzoo.comparison.figures import draw_scenes, figures, with_interval
 from dexzoo.comparison.scores import Labels, first_image, measure, model_scores, read_labels
 from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.data.schema import SOURCES
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.resources import resource
 
 NUM_VALIDATIONS = 20
-SOURCES = ("generated", "perturbed")
 Replicates = NDArray[np.float64]
 FIGURES = ("accuracy", "auroc", "scene_auroc", "average_precision", "calibration_error", "top1", "top5")
-ADAMW = {
-    "model.gain": 1.4142,
-    "model.optimizer": "adamw",
-    "model.learning_rate": 0.0003,
-    "model.weight_decay": 0.01,
-    "model.average_decay": 0.99,
-    "trainer.precision": "bf16-mixed",
-}
-"""How configs/em2-adamw.yaml differs from the thesis' recipe, for em1, which has no such file."""
 
 
 class Run(NamedTuple):
@@ -55,15 +46,18 @@ class Run(NamedTuple):
 
 def runs() -> dict[str, Run]:
     """All runs by name: whole models, then NAME-WHAT without an ingredient, NAME@PERCENT on less data, NAME+VARIANT."""
-    whole = {"em_fk": ("em_fk.yaml", {}), "em2": ("em2-adamw.yaml", {}), "em1": ("em1.yaml", ADAMW)}
+    whole = {"em_fk": ("em_fk.yaml", {}), "em2": ("em2-adamw.yaml", {}), "em1": ("em1-adamw.yaml", {})}
     known = {name: Run(*made) for name, made in whole.items()}
     for part in ("image", "depth", "cloud", "table", "attention"):
         known[f"em_fk-{part}"] = Run("em_fk.yaml", {f"model.{part}": False}, "em_fk")
-    known["em_fk-perturbed"] = Run("em_fk.yaml", {"data.sources": ["generated"]}, "em_fk")
+    for part in ("perturbed", "refined"):
+        rest = [source for source in SOURCES if source != part]
+        known[f"em_fk-{part}"] = Run("em_fk.yaml", {"data.sources": rest}, "em_fk")
     for share in (10, 30):
         for name, (config, changes) in whole.items():
             known[f"{name}@{share}"] = Run(config, changes | {"data.train_share": share / 100}, name)
     known["em2+4096"] = Run("em2-adamw.yaml", {"model.width": 4096}, "em2")
+    known["em1+thesis"] = Run("em1.yaml", {}, "em1")
     known["em2+thesis"] = Run("em2.yaml", {}, "em2")
     return known
 

@@ -124,13 +124,17 @@ def ablation(found: dict[str, Any]) -> str:
 
 
 def runs_table(runs: dict[str, Any]) -> str:
-    head = ("run", "training grasps", "accuracy", "AUROC", "change", "top-1", "change", "AUROC on perturbed", "change")
+    head = (
+        "run", "training grasps", "validation AUROC", "accuracy", "AUROC", "change", "top-1", "change",
+        "AUROC on perturbed", "change",
+    )  # fmt: skip
     return table(
         head,
         [
             (
                 name,
                 f"{row['train_grasps']:,}",
+                f"{row['validation_auroc']:.3f}",
                 figure(row, "figures", GENERATED, "accuracy", 100, 1),
                 *(figure(row, key, GENERATED, "auroc", 1, 3) for key in ("figures", "change")),
                 *(figure(row, key, GENERATED, "top1", 100, 1) for key in ("figures", "change")),

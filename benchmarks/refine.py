@@ -13,6 +13,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from dexzoo.sim import Scene, trial
 
 METHOD = "method"
 SPLITS = ("test", "validation")
-NUM_POINTS = 2000
+NUM_POINTS = 500
 """Observed points by which penetration is measured."""
 Variant = Callable[[Grasps, Observation, GraspDensity], Refinement]
 
@@ -50,10 +51,10 @@ def by_thesis(evaluator: GraspEvaluator, group: str) -> Variant:
     return lambda grasps, view, _: thesis.ascend(grasps, view, evaluator, group=group)
 
 
-def variants(options: argparse.Namespace) -> dict[str, Variant]:
+def variants(
+    model: GraspEvaluator, judge: GraspEvaluator | None, others: list[str], tries: Path | None
+) -> dict[str, Variant]:
     """All that can be run, by name, the method first."""
-    model = dexzoo.load(options.evaluator)
-    judge = dexzoo.load(options.judge) if options.judge else None
     method = partial(by_refine, model, judge)
     known = {
         METHOD: method(),
@@ -67,11 +68,13 @@ def variants(options: argparse.Namespace) -> dict[str, Variant]:
         "280 free numbers": method(variables="waypoints"),
     }
     if judge is not None:
-        known["no acceptance"] = by_refine(model, None)
-    for other in options.others:
-        known[f"guided by {other}"] = by_refine(dexzoo.load(other), judge)
-    if options.tries:
-        for name, arguments in json.loads(options.tries.read_text()).items():
+        known["no judge"] = by_refine(model, None)
+    for name in others:
+        other = dexzoo.load(name)
+        known[f"guided by {name}"] = by_refine(other, judge)
+        known |= {f"group {group} by {name}": by_thesis(other, group) for group in thesis.GROUPS}
+    if tries:
+        for name, arguments in json.loads(tries.read_text()).items():
             for key, kind in (("region", Region), ("weights", Weights)):
                 if key in arguments:
                     arguments[key] = kind(**arguments[key])
@@ -83,7 +86,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--evaluator", default="em_fk", help="what guides: name, file or folder")
     parser.add_argument("--judge", help="what accepts, the same")
-    parser.add_argument("--others", nargs="*", default=[], help="evaluators that guide in its place, each a variant")
+    parser.add_argument("--others", nargs="*", default=[], help="evaluators that guide in its place")
     parser.add_argument("--tries", type=Path, help="JSON of further variants")
     parser.add_argument("--variants", nargs="+", metavar="NAME", help="default: all")
     parser.add_argument("--split", default="test", choices=SPLITS)
@@ -96,7 +99,9 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("out/refine"))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    known = variants(options)
+    model = dexzoo.load(options.evaluator)
+    judge = dexzoo.load(options.judge) if options.judge else None
+    known = variants(model, judge, options.others, options.tries)
     names = options.variants or list(known)
     if unknown := set(names) - set(known):
         parser.error(f"variants {', '.join(sorted(unknown))} are unknown; use some of {', '.join(known)}")
@@ -105,7 +110,7 @@ def main() -> None:
     source = "meshes" if options.meshes else options.split
     folder = options.folder / f"{source}_{options.num_grasps}"
     # what was refined depends on who guided and who judged
-    refined = folder / "_".join(name.replace("/", "-") for name in (options.evaluator, options.judge or "nobody"))
+    refined = folder / "_".join(one.digest[:8] if one else "nobody" for one in (model, judge))
     if not options.done:
         chosen = {name: known[name] for name in names}
         run(
@@ -123,6 +128,8 @@ def main() -> None:
     result = {
         "evaluator": options.evaluator,
         "judge": options.judge,
+        "digest": {"evaluator": model.digest, "judge": judge.digest if judge else None},
+        "defaults": {"region": asdict(Region()), "weights": asdict(Weights())},
         "split": source,
         "num_grasps": options.num_grasps,
         "without_grasp": sum(not len(row) for row in given.values()),

@@ -2,14 +2,13 @@
 
 import sys
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from generator_figures import FLAGS, Counts, Kept, change_of, mean, rate, resampled
 
-from dexzoo.grasp import Grasps
-from dexzoo.refinement import RANKINGS, Refinement, rank
+from dexzoo.refinement import RANKINGS, rank
 
 GENERATOR = "generator"
 """The rule that takes the generator's own first."""
@@ -66,23 +65,27 @@ class Refined(Kept):
 
     def first(self, rule: str) -> int:
         """The row that a rule ranks first."""
-        return 0 if rule == GENERATOR else int(rank(self._result(), rule)[0])
+        return 0 if rule == GENERATOR else int(rank(self._scores(), rule)[0])
 
     def first_unrefined(self, rule: str) -> int:
         """The row that the rule would rank first had nothing been refined."""
         if rule == GENERATOR:
             return 0
-        return int(rank(self._result(self.score_before, self.judge_before), rule)[0])
+        return int(rank(self._scores(refined=False), rule)[0])
 
-    def _result(self, after: np.ndarray | None = None, judged: np.ndarray | None = None) -> Refinement:
-        """The scores in the form that ranking takes; the grasps play no part."""
-        count = len(self.replaced)
-        still, flag = Grasps(torch.eye(28)[3].expand(count, 10, 28), "world"), torch.zeros(count, dtype=torch.bool)
-        scores = (self.score_before, self.score_after if after is None else after)
-        opinions = (self.judge_before, self.judge_after if judged is None else judged)
-        known = not np.isnan(self.judge_before).any()
-        judges = [torch.tensor(opinion) if known else None for opinion in opinions]
-        return Refinement(still, *(torch.tensor(score) for score in scores), flag, flag, {}, *judges)
+    def _scores(self, *, refined: bool = True) -> "Scores":
+        """What ranking looks at; of the given grasps alone where nothing had been refined."""
+        after, judge = (self.score_after, self.judge_after) if refined else (self.score_before, self.judge_before)
+        known = not np.isnan(judge).any()
+        return Scores(torch.tensor(self.score_before), torch.tensor(after), torch.tensor(judge) if known else None)
+
+
+class Scores(NamedTuple):
+    """The scores of a scene's grasps, as ranking takes them."""
+
+    score_before: torch.Tensor
+    score_after: torch.Tensor
+    judge_after: torch.Tensor | None
 
 
 def compared(given: dict[int, Given], done: dict[str, dict[int, Refined]]) -> dict[str, dict[str, Any]]:
@@ -115,7 +118,7 @@ def summarise(given: list[Given], rows: list[Refined]) -> dict[str, Any]:
     deep, then = (np.concatenate([row.penetration for row in some]) for some in (given, rows))
     cost = np.array([row.cost for row in rows])
     judged = not any(np.isnan(row.judge_before).any() for row in rows)
-    rules = [GENERATOR, *(name for name in RANKINGS if judged or name != "judge")]
+    rules = [GENERATOR, *(name for name in RANKINGS if judged or name not in ("judge", "mean"))]
     return {
         "scenes": len(rows),
         "objects": len({row.object for row in given}),

@@ -13,6 +13,8 @@ RULES = {
     "judge": "judge",
     "mean": "mean of evaluator and judge",
 }
+GROUP = "group "
+"""How the names of the thesis' groups begin in the benchmark."""
 MESHES = "### On objects from elsewhere\n\n"
 
 
@@ -56,8 +58,23 @@ def whole(found: dict[str, Any]) -> str:
                     for other, row in variants.items()
                 ],
             ),
+            *(groups(variants) if any(GROUP in other for other in variants) else ()),
         ]
     )  # fmt: skip
+
+
+def groups(variants: dict[str, Any]) -> tuple[str, str]:
+    """What became of the first of each scene in the thesis' groups."""
+    rows = [
+        (other, RULES[rule], *row["top1"][rule]["transitions"].values())
+        for other, row in variants.items()
+        for rule in row["top1"]
+        if GROUP in other
+    ]
+    went = heads(next(iter(variants.values()))["transitions"])
+    return "What became of the first of each scene in the thesis' groups:\n", table(
+        ("variant", "ranked by", *went), rows
+    )
 
 
 def heads(names: dict[str, Any]) -> tuple[str, ...]:

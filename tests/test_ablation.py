@@ -14,6 +14,7 @@ import torch
 from dexzoo.comparison import scores
 from dexzoo.comparison.compare import compare
 from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.data.schema import SOURCES
 from dexzoo.models.em2 import EM2
 from dexzoo.models.zoo import load
 from dexzoo.resources import resource
@@ -43,6 +44,10 @@ def test_every_run_names_arguments_that_there_are(ablation: Any) -> None:  # noq
             part, argument = key.split(".")
             if part == "model":
                 assert argument in shipped["model"]["init_args"], name
+        whole, _, without = name.partition("-")
+        if without:  # one ingredient less, and nothing else
+            assert [*run.changes.values()] in ([False], [[source for source in SOURCES if source != without]]), name
+            assert run.against == whole
         assert made["trainer"]["max_steps"] * made["data"]["batch_size"] == 64_000
         assert run.against is None or run.against in ablation.runs()
 

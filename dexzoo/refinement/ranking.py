@@ -7,43 +7,59 @@ picked by the score before 90 % (Table 4.6 and section 5).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dexzoo.refinement.method import Refinement
+
+@runtime_checkable
+class Scored(Protocol):
+    """What rules look at: a `Refinement`, or as much of it. Tensors (num_grasps,)."""
+
+    @property
+    def score_before(self) -> Tensor:
+        """The evaluator's score of the given grasps."""
+
+    @property
+    def score_after(self) -> Tensor:
+        """The evaluator's score of the returned grasps."""
+
+    @property
+    def judge_after(self) -> Tensor | None:
+        """The judge's score of the returned grasps, where there was one."""
 
 
-def before(result: Refinement) -> Float[Tensor, " grasp"]:
+def before(result: Scored) -> Float[Tensor, " grasp"]:
     """The evaluator's score of the given grasp: refinement changes grasps, not their order."""
     return result.score_before
 
 
-def after(result: Refinement) -> Float[Tensor, " grasp"]:
+def after(result: Scored) -> Float[Tensor, " grasp"]:
     """The evaluator's score of the returned grasp."""
     return result.score_after
 
 
-def lesser(result: Refinement) -> Float[Tensor, " grasp"]:
+def lesser(result: Scored) -> Float[Tensor, " grasp"]:
     """The lesser of both scores."""
     return torch.minimum(result.score_before, result.score_after)
 
 
-def judge(result: Refinement) -> Float[Tensor, " grasp"]:
+def judge(result: Scored) -> Float[Tensor, " grasp"]:
     """The judge's score of the returned grasp. ValueError where there was no judge."""
     check("judge", result.judge_after is not None)
     assert result.judge_after is not None
     return result.judge_after
 
 
-def mean(result: Refinement) -> Float[Tensor, " grasp"]:
+def mean(result: Scored) -> Float[Tensor, " grasp"]:
     """The mean log-odds of the returned grasp: of the evaluator and, where there was one, the judge."""
     scores = [result.score_after] if result.judge_after is None else [result.score_after, result.judge_after]
     return torch.stack([torch.logit(score, 1e-6) for score in scores]).mean(0).sigmoid()
 
 
-RANKINGS: dict[str, Callable[[Refinement], Tensor]] = {
+RANKINGS: dict[str, Callable[[Scored], Tensor]] = {
     "before": before,
     "after": after,
     "lesser": lesser,
@@ -60,7 +76,7 @@ def check(by: str, judged: bool) -> None:
         raise ValueError('ranking by "judge" needs a refinement with a judge')
 
 
-def rank(result: Refinement, by: str = "before") -> Tensor:
+def rank(result: Scored, by: str = "before") -> Tensor:
     """Indices of the returned grasps, the best first; ties stay in order. ValueError for a rule that is not known."""
     check(by, result.judge_after is not None)
     return RANKINGS[by](result).argsort(descending=True, stable=True)
