@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import cv2
 import numpy as np
@@ -22,7 +22,8 @@ from dexzoo.data.schema import SPLITS
 from dexzoo.grasp import JOINTS, SQUEEZE, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.models.em2 import EM2
-from dexzoo.models.evaluator import GraspEvaluator, Scene
+from dexzoo.models.ensemble import Ensemble
+from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
 
 NUM_SCENES = len(synthetic.SPLIT_OF)
 
@@ -32,8 +33,8 @@ class Closure(GraspEvaluator):
 
     architecture: ClassVar[str] = "closure"
 
-    def __init__(self, gain: float = 50.0) -> None:
-        super().__init__()
+    def __init__(self, gain: float = 50.0, **training: Unpack[TrainingOptions]) -> None:
+        super().__init__(**training)
         self.gain = gain
         self.head = nn.Linear(15, 1)
         nn.init.constant_(self.head.weight, gain / 15)
@@ -65,6 +66,13 @@ def data(folder: Path, tmp_path: Path) -> GraspDataModule:
     likelihood = [None if kind == "perturbed" else x for kind, x in zip(source.source, np.sin(range(240)), strict=True)]
     source.grasps = source.grasps.set_column(place, "log_likelihood", pa.array(likelihood, pa.float32()))
     return module
+
+
+@pytest.fixture
+def ensemble(tmp_path: Path) -> Ensemble:
+    """Two members, which hold their weights in files of their own."""
+    files = [Closure(gain).save(tmp_path / f"{gain}.safetensors") for gain in (50.0, 20.0)]
+    return Ensemble(members=[str(path) for path in files]).eval()
 
 
 @pytest.fixture
@@ -199,6 +207,12 @@ def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
     draw_inside({"em2": em2, "runs/closure": Closure()}, data, "test", tmp_path)
     names = {path.name for path in tmp_path.glob("*.png")}
     assert names == {"em2_maps.png", "em2_grasps.png", "runs_closure_grasps.png"}
+
+
+def test_what_has_nothing_inside_is_left_out(data: GraspDataModule, ensemble: Ensemble, tmp_path: Path) -> None:
+    assert grasp_features(ensemble, data.dataset("test", ensemble)) is None
+    draw_inside({"ensemble": ensemble, "right": Closure()}, data, "test", tmp_path)
+    assert {path.name for path in tmp_path.glob("*.png")} == {"right_grasps.png"}
 
 
 def test_principal_components_agree_with_scikit_learn() -> None:
