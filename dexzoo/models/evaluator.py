@@ -154,6 +154,11 @@ class GraspEvaluator(LightningModule):
         """Set what is standardised by the training data; called once, before training. Nothing by default."""
 
     @property
+    def parts(self) -> tuple[GraspEvaluator, ...]:
+        """All evaluators that take part, each with a file of its own: this one, and an ensemble's members."""
+        return (self,)
+
+    @property
     def arguments(self) -> dict[str, Any]:
         """The constructor's arguments, from which the same architecture can be made again."""
         classes = [cls for cls in type(self).__mro__ if issubclass(cls, GraspEvaluator) and "__init__" in cls.__dict__]
