@@ -103,6 +103,14 @@ def test_who_knows_is_told_from_who_errs(data: GraspDataModule, models: dict[str
     assert against["both"] + against["only_this"] == 5
 
 
+def test_the_weights_that_were_compared_are_named(data: GraspDataModule, ensemble: Ensemble, tmp_path: Path) -> None:
+    path = ensemble.save(tmp_path / "both")
+    files = [path, *(Path(member) for member in ensemble.members)]
+    sha256 = [json.loads(file.with_suffix(".json").read_text())["sha256"] for file in files]
+    result = compare(load_models([str(path), ensemble.members[0]]) | {"made": Closure()}, data)
+    assert result["weights"] == {"ensemble": sha256, "50.0": [sha256[1]], "made": [None]}
+
+
 def test_the_threshold_of_gm_comes_from_validation(data: GraspDataModule) -> None:
     rows = (data.source.grasp_scene == 4) & (data.source.source == "generated")
     held = data.source.success[rows]

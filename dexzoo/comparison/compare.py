@@ -51,7 +51,8 @@ def compare(
     models: by the names of their rows. seed: of the coin and of the bootstrap's draws. The same call gives the same
     result, but for the times in `cost`.
 
-    Returns plain values, ready for JSON: split, seed, num_draws; data (version and checksum of the set); sources, for
+    Returns plain values, ready for JSON: split, seed, num_draws; data (version and checksum of the set); weights, by
+    model, checksums of its file and of its members', None for one that was not read from a file; sources, for
     generated grasps and, where the split has some, for perturbed and refined ones: how many grasps, objects and scenes,
     the success rate, and in `rows`, by name, what `figures.describe` and `figures.against` say; cost, by model. Ranks
     are within the grasps of one source in one scene, each seen in the view that the set pairs it with. There is no row
@@ -77,6 +78,7 @@ def compare(
         "seed": seed,
         "num_draws": NUM_DRAWS,
         "data": {"version": VERSION, "sha256": data.source.sha256},
+        "weights": {name: [part.sha256 for part in model.parts] for name, model in models.items()},
         "sources": {source: _section(labels[source], rows[source], validation, seed) for source in labels},
         "cost": cost,
     }

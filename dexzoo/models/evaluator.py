@@ -99,6 +99,8 @@ class GraspEvaluator(LightningModule):
     architecture: ClassVar[str]
     temperature: Tensor
     offset: Tensor
+    sha256: str | None = None
+    """Of the file that `dexzoo.load` read; None for a model that was made otherwise."""
     frozen_encoder: ClassVar[bool] = False
     """Whether `encode` has nothing to train, so that its result can be kept for the next epoch and on disk."""
 
