@@ -11,7 +11,6 @@ from typing import Any
 from tables import ROOT, read, table
 
 from dexzoo.comparison.report import cost_table, main_table, title
-from dexzoo.comparison.report import table as markdown_table
 from dexzoo.comparison.scores import COIN, GM
 from dexzoo.models.zoo import list_models, load, model_class, shipped_card
 
@@ -89,8 +88,8 @@ def figures(name: str, found: dict[str, Any]) -> str:
     parts = ["95 % bootstrap intervals over scenes; p against gm, the generator's own order.\n"]
     for source, section in found["sources"].items():
         rows = {label: row for label, row in section["rows"].items() if label in (name, GM, COIN)}
-        parts += [f"{title(source, section)}:\n", markdown_table(main_table(section | {"rows": rows}))]
-    return "\n".join([*parts, markdown_table(cost_table({name: found["cost"][name]}))])
+        parts += [f"{title(source, section)}:\n", table(*main_table(section | {"rows": rows}))]
+    return "\n".join([*parts, table(*cost_table({name: found["cost"][name]}))])
 
 
 def calibration(name: str) -> str:

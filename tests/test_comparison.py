@@ -188,7 +188,7 @@ def test_the_folder_holds_tables_numbers_and_pictures(
 
 
 def test_the_best_of_a_column_is_bold(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
-    head, right, wrong, gm, _ = main_table(compare(models, data)["sources"]["generated"])
+    head, (right, wrong, gm, _) = main_table(compare(models, data)["sources"]["generated"])
     for name in ("accuracy", "AUROC", "top-1", "Brier"):
         assert right[head.index(name)].startswith("**"), name
         assert not wrong[head.index(name)].startswith("**"), name

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,8 +13,12 @@ from rich.table import Table
 
 from dexzoo.comparison.charts import draw_charts
 
-Cells = list[list[str]]
-"""A table: its head, then its rows."""
+
+class Cells(NamedTuple):
+    """A table."""
+
+    head: list[str]
+    rows: list[list[str]]
 
 
 class _Column(NamedTuple):
@@ -61,7 +66,7 @@ def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
     """
     rows: dict[str, Any] = section["rows"]
     columns = {name: column for name, column in _COLUMNS.items() if not brief or name in _BRIEF}
-    table = [["", *(column.heading for column in columns.values()), "p"]]
+    found = Cells(["", *(column.heading for column in columns.values()), "p"], [])
     best = {name: _best([row["figures"].get(name) for row in rows.values()], name) for name in columns}
     for label, row in rows.items():
         cells = []
@@ -73,14 +78,14 @@ def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
             if column.with_interval and not brief and figure.get("interval"):
                 cell += " ({} to {})".format(*(_number(end, column) for end in figure["interval"]))
             cells.append(cell)
-        table.append([label, *cells, _p(row.get("against_gm", {}).get("top1"))])
-    return table
+        found.rows.append([label, *cells, _p(row.get("against_gm", {}).get("top1"))])
+    return found
 
 
 def terminal_table(result: dict[str, Any]) -> Table:
     """The main table of the first source, the generated grasps, for a terminal of 80 columns."""
     source, section = next(iter(result["sources"].items()))
-    head, *rows = main_table(section, brief=True)
+    head, rows = main_table(section, brief=True)
     shown = Table(*head, title=title(source, section), box=box.SIMPLE)
     for row in rows:
         shown.add_row(*(re.sub(r"\*\*(.*?)\*\*", r"[bold]\1[/bold]", cell) for cell in row))
@@ -89,17 +94,17 @@ def terminal_table(result: dict[str, Any]) -> Table:
 
 def counts_table(section: dict[str, Any]) -> Cells:
     """True and false positives and negatives (thesis, Table 3.3), and the cross table of top-1 with gm (Table 3.4)."""
-    table = [["", *_COUNTS.values(), *_CROSS.values()]]
+    found = Cells(["", *_COUNTS.values(), *_CROSS.values()], [])
     for label, row in section["rows"].items():
         counts, cross = row["counts"] or {}, row.get("against_gm", {}).get("top1", {})
         cells = [*(counts.get(name) for name in _COUNTS), *(cross.get(name) for name in _CROSS)]
-        table.append([label, *("" if cell is None else f"{cell:,}" for cell in cells)])
-    return table
+        found.rows.append([label, *("" if cell is None else f"{cell:,}" for cell in cells)])
+    return found
 
 
 def cost_table(cost: dict[str, dict[str, Any]]) -> Cells:
     """Size and speed of the models."""
-    return [["", *_COST.values()], *([label, *(f"{row[name]:,}" for name in _COST)] for label, row in cost.items())]
+    return Cells(["", *_COST.values()], [[label, *(f"{row[name]:,}" for name in _COST)] for label, row in cost.items()])
 
 
 def title(source: str, section: dict[str, Any]) -> str:
@@ -114,15 +119,15 @@ def markdown(result: dict[str, Any]) -> str:
     """The whole comparison: for each source the main table and the counts, then the cost."""
     parts = [f"# Comparison on the {result['split']} split\n", NOTES]
     for source, section in result["sources"].items():
-        parts += [f"## {title(source, section)}\n", table(main_table(section)), table(counts_table(section))]
-    parts += ["## Cost\n", table(cost_table(result["cost"]))]
+        parts += [f"## {title(source, section)}\n", table(*main_table(section)), table(*counts_table(section))]
+    parts += ["## Cost\n", table(*cost_table(result["cost"]))]
     return "\n".join(parts)
 
 
-def table(cells: Cells) -> str:
-    """Cells in Markdown."""
-    lines = [f"| {' | '.join(row)} |" for row in cells]
-    return "\n".join([lines[0], "|" + "---|" * len(cells[0]), *lines[1:]]) + "\n"
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    first, *others = (f"| {' | '.join(map(str, row))} |" for row in (head, *rows))
+    return "\n".join([first, "|" + "---|" * len(head), *others]) + "\n"
 
 
 def write(result: dict[str, Any], folder: Path) -> None:
