@@ -4,7 +4,7 @@ from typing import Any
 
 from tables import RESULTS, percent, read, span, table
 
-from dexzoo.comparison.report import NOTES, cost_table, counts_table, main_table, title
+from dexzoo.comparison.report import NOTES, against_em2, cost_table, counts_table, main_table, title
 
 GENERATED = "generated"
 WITHOUT, LESS_DATA, VARIANT = "-", "@", "+"
@@ -28,7 +28,7 @@ def comparison(found: dict[str, Any]) -> str:
     parts = ["## Evaluators\n", f"`benchmarks/comparison.py`. {NOTES}"]
     for source, section in found["sources"].items():
         parts += [f"{title(source, section)}:\n", table(*main_table(section))]
-        parts += [table(*counts_table(section))] if source == "generated" else []
+        parts += [table(*counts_table(section)), *against_em2(section)] if source == GENERATED else []
     parts += [
         table(*cost_table(found["cost"])),
         "![Success by place in the ranking](comparison/rank.png)\n",

@@ -1,6 +1,7 @@
 """Comparisons of a grasp set, with evaluators of which the outcome is known."""
 
 import json
+import runpy
 from pathlib import Path
 from typing import Any, ClassVar, Unpack
 
@@ -25,7 +26,7 @@ from dexzoo.models.em2 import EM2
 from dexzoo.models.ensemble import Ensemble
 from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
 
-NUM_SCENES = len(synthetic.SPLIT_OF)
+ROOT = Path(__file__).parent.parent
 
 
 class Closure(GraspEvaluator):
@@ -194,6 +195,22 @@ def test_the_best_of_a_column_is_bold(data: GraspDataModule, models: dict[str, G
         assert not wrong[head.index(name)].startswith("**"), name
     assert right[head.index("accuracy")] == "**100.0** (100.0 to 100.0)"
     assert gm[head.index("Brier")] == ""
+
+
+def test_all_are_set_against_em2_where_it_is_compared(
+    data: GraspDataModule, models: dict[str, GraspEvaluator], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "against em2" not in markdown(compare(models, data))
+    result = compare({"em_fk": models["right"], "em2": models["wrong"]}, data)
+    rows = result["sources"]["generated"]["rows"]
+    assert [name for name in rows if "against_em2" in rows[name]] == ["em_fk", "gm", "coin"]
+    assert rows["em_fk"]["against_em2"]["top1"]["failures_removed"] == {"value": 1, "interval": [1, 1]}
+    line = "| em_fk | +100.0 (+100.0 to +100.0) | +100.0 (+100.0 to +100.0) | +100.0 (+100.0 to +100.0) |"
+    line += " 0 | 5 | 0 | 0 | 0.0625 |"
+    assert markdown(result).count(line) == 2  # of generated and of perturbed grasps
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    page = runpy.run_path(str(ROOT / "benchmarks" / "evaluator_report.py"))["comparison"](result)
+    assert page.count(line) == 1
 
 
 def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import torch
 from dexzoo.comparison.figures import NUM_DRAWS, against, describe, draw_scenes
 from dexzoo.comparison.scores import (
     COIN,
+    EM2,
     GM,
     Labels,
     Scores,
@@ -90,6 +91,7 @@ def _section(labels: Labels, rows: dict[str, Scores], validation: Labels | None,
     reference = {} if likelihood is None else {GM: likelihood}
     rows = {**rows, **reference, COIN: coin_scores(labels, seed)}
     draws = draw_scenes(labels.num_scenes, seed)
+    others = [name for name in (GM, EM2) if name in rows]
     return {
         "grasps": len(labels.success),
         "objects": len(set(labels.objects)),
@@ -97,7 +99,7 @@ def _section(labels: Labels, rows: dict[str, Scores], validation: Labels | None,
         "success_rate": float(labels.success.mean()),
         "rows": {
             name: describe(labels, scores, draws)
-            | ({"against_gm": against(labels, scores, likelihood)} if likelihood is not None and name != GM else {})
+            | {f"against_{one}": against(labels, scores, rows[one], one, draws) for one in others if one != name}
             for name, scores in rows.items()
         },
     }

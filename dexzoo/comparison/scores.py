@@ -23,6 +23,8 @@ from dexzoo.models.evaluator import CHUNK, GraspEvaluator, Scene
 
 GM, COIN = "gm", "coin"
 """The rows that every comparison has: the generative model, ranking by its own likelihood, and chance."""
+EM2 = "em2"
+"""The thesis' evaluator, which the other rows are set against where it is compared."""
 NUM_TIMED = 1000
 _REPEATS = 3
 
