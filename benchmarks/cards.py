@@ -1,8 +1,8 @@
 """Write docs/cards/NAME.md for every model that comes with weights.
 
 python benchmarks/cards.py
-What it is comes from the class, what it was trained on and its limits from assets/checkpoints/NAME.json, its figures
-from benchmarks/results/comparison.json.
+What it is comes from the class, what it was trained on and its limits from assets/checkpoints/NAME.json, what its
+frozen trunk is from the trunk's own card there, its figures from benchmarks/results/comparison.json.
 """
 
 import inspect
@@ -12,9 +12,12 @@ from tables import ROOT, read, table
 
 from dexzoo.comparison.report import cost_table, main_table, title
 from dexzoo.comparison.scores import COIN, GM
+from dexzoo.models.trunks import trunk_card
 from dexzoo.models.zoo import list_models, load, model_class, shipped_card
 
 CARDS = ROOT / "docs" / "cards"
+TRUNK = ("trunk", "source", "licence", "paper", "data", "sha256")
+"""What is told of a trunk, as far as its card has it."""
 USE = """\
 ```python
 evaluator = dexzoo.load("{name}")
@@ -54,14 +57,16 @@ def page(name: str) -> str:
         USE.format(name=name),
         "## Trained on\n",
         training(card),
+        *trunk(card["arguments"]),
         "## On test objects\n",
         figures(name, found),
         calibration(name),
         "## Limits\n",
         "".join(f"- {limit}\n" for limit in card["limits"]),
         "## File\n",
-        f"`assets/checkpoints/{name}.safetensors`, {card['precision']}, without the shared trunk; SHA-256 "
-        f"`{card['sha256']}`. Arguments: {listed(card['arguments'])}.\n",
+        f"`assets/checkpoints/{name}.safetensors`, {card['precision']}"
+        f"{', without the shared trunk' if 'trunk' in card['arguments'] else ''}; SHA-256 `{card['sha256']}`. "
+        f"Arguments: {listed(card['arguments'])}.\n",
     ]
     return "\n".join(parts)
 
@@ -79,6 +84,20 @@ def training(card: dict[str, Any]) -> str:
         *((name, value) for name, value in settings.items() if value is not None),
     ]
     return table(("what", ""), rows)
+
+
+def trunk(arguments: dict[str, Any]) -> list[str]:
+    """What the frozen trunk is, for a model that has one."""
+    if "trunk" not in arguments:
+        return []
+    name = arguments["trunk"]
+    card = trunk_card(name) or {"trunk": f"{name}, fetched by torchvision"}
+    rows = [(key, listed(card[key]) if isinstance(card[key], dict) else card[key]) for key in TRUNK if key in card]
+    return [
+        "## Frozen trunk\n",
+        "It sees the colourised depth image; nothing of it was trained with grasps.\n",
+        table(("what", ""), rows),
+    ]
 
 
 def figures(name: str, found: dict[str, Any]) -> str:
