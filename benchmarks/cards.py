@@ -1,8 +1,8 @@
 """Write docs/cards/NAME.md for every model that comes with weights.
 
 python benchmarks/cards.py
-What it is comes from the class, what it was trained on and its limits from assets/checkpoints/NAME.json, its figures
-from benchmarks/results/comparison.json.
+What it is comes from the class, what it was trained on and its limits from assets/checkpoints/NAME.json, what its
+frozen trunk is from the trunk's own card there, its figures from benchmarks/results/comparison.json.
 """
 
 import inspect
@@ -11,11 +11,13 @@ from typing import Any
 from tables import ROOT, read, table
 
 from dexzoo.comparison.report import cost_table, main_table, title
-from dexzoo.comparison.report import table as markdown_table
 from dexzoo.comparison.scores import COIN, GM
+from dexzoo.models.trunks import trunk_card
 from dexzoo.models.zoo import list_models, load, model_class, shipped_card
 
 CARDS = ROOT / "docs" / "cards"
+TRUNK = ("trunk", "source", "licence", "paper", "data", "sha256")
+"""What is told of a trunk, as far as its card has it."""
 USE = """\
 ```python
 evaluator = dexzoo.load("{name}")
@@ -55,14 +57,16 @@ def page(name: str) -> str:
         USE.format(name=name),
         "## Trained on\n",
         training(card),
+        *trunk(card["arguments"]),
         "## On test objects\n",
         figures(name, found),
         calibration(name),
         "## Limits\n",
         "".join(f"- {limit}\n" for limit in card["limits"]),
         "## File\n",
-        f"`assets/checkpoints/{name}.safetensors`, {card['precision']}, without the shared trunk; SHA-256 "
-        f"`{card['sha256']}`. Arguments: {listed(card['arguments'])}.\n",
+        f"`assets/checkpoints/{name}.safetensors`, {card['precision']}"
+        f"{', without the shared trunk' if 'trunk' in card['arguments'] else ''}; SHA-256 `{card['sha256']}`. "
+        f"Arguments: {listed(card['arguments'])}.\n",
     ]
     return "\n".join(parts)
 
@@ -82,6 +86,20 @@ def training(card: dict[str, Any]) -> str:
     return table(("what", ""), rows)
 
 
+def trunk(arguments: dict[str, Any]) -> list[str]:
+    """What the frozen trunk is, for a model that has one."""
+    if "trunk" not in arguments:
+        return []
+    name = arguments["trunk"]
+    card = trunk_card(name) or {"trunk": f"{name}, fetched by torchvision"}
+    rows = [(key, listed(card[key]) if isinstance(card[key], dict) else card[key]) for key in TRUNK if key in card]
+    return [
+        "## Frozen trunk\n",
+        "It sees the colourised depth image; nothing of it was trained with grasps.\n",
+        table(("what", ""), rows),
+    ]
+
+
 def figures(name: str, found: dict[str, Any]) -> str:
     """Its rows of the comparison, with gm and the coin beside it; size and speed."""
     if name not in found["cost"]:
@@ -89,8 +107,8 @@ def figures(name: str, found: dict[str, Any]) -> str:
     parts = ["95 % bootstrap intervals over scenes; p against gm, the generator's own order.\n"]
     for source, section in found["sources"].items():
         rows = {label: row for label, row in section["rows"].items() if label in (name, GM, COIN)}
-        parts += [f"{title(source, section)}:\n", markdown_table(main_table(section | {"rows": rows}))]
-    return "\n".join([*parts, markdown_table(cost_table({name: found["cost"][name]}))])
+        parts += [f"{title(source, section)}:\n", table(*main_table(section | {"rows": rows}))]
+    return "\n".join([*parts, table(*cost_table({name: found["cost"][name]}))])
 
 
 def calibration(name: str) -> str:

@@ -4,8 +4,7 @@ from typing import Any
 
 from tables import RESULTS, percent, read, span, table
 
-from dexzoo.comparison.report import NOTES, cost_table, counts_table, main_table, title
-from dexzoo.comparison.report import table as markdown_table
+from dexzoo.comparison.report import NOTES, against_em2, cost_table, counts_table, main_table, title
 
 GENERATED = "generated"
 WITHOUT, LESS_DATA, VARIANT = "-", "@", "+"
@@ -28,10 +27,10 @@ def comparison(found: dict[str, Any]) -> str:
     """The comparison's own tables, and its charts."""
     parts = ["## Evaluators\n", f"`benchmarks/comparison.py`. {NOTES}"]
     for source, section in found["sources"].items():
-        parts += [f"{title(source, section)}:\n", markdown_table(main_table(section))]
-        parts += [markdown_table(counts_table(section))] if source == "generated" else []
+        parts += [f"{title(source, section)}:\n", table(*main_table(section))]
+        parts += [table(*counts_table(section)), *against_em2(section)] if source == GENERATED else []
     parts += [
-        markdown_table(cost_table(found["cost"])),
+        table(*cost_table(found["cost"])),
         "![Success by place in the ranking](comparison/rank.png)\n",
         "![Calibration](comparison/reliability.png)\n",
         "![Success of the first grasp by category](comparison/categories.png)\n",
@@ -76,7 +75,7 @@ def meshes(found: dict[str, Any]) -> str:
             "choose a threshold for gm on; scenes of one object are alike, so that intervals are too narrow. "
             f"Objects without any grasp: {without or 'none'}.\n\n"
             f"{title(GENERATED, section)}:\n",
-            markdown_table(main_table(section)),
+            table(*main_table(section)),
             table(
                 ("object", "scenes", "grasps", "hold", "hit the table", *(f"first of {name} holds" for name in rows)),
                 [

@@ -4,6 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from dexzoo.comparison.report import table as table
+
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 BEGIN, END = "<!-- figures: benchmarks/report.py -->", "<!-- end of figures -->"
@@ -25,8 +27,3 @@ def percent(value: float) -> str:
 
 def span(interval: list[float], scale: float = 1.0, digits: int = 3) -> str:
     return f"{scale * interval[0]:.{digits}f} to {scale * interval[1]:.{digits}f}"
-
-
-def table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(lines + ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]) + "\n"

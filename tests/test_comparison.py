@@ -1,8 +1,9 @@
 """Comparisons of a grasp set, with evaluators of which the outcome is known."""
 
 import json
+import runpy
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import cv2
 import numpy as np
@@ -22,9 +23,10 @@ from dexzoo.data.schema import SPLITS
 from dexzoo.grasp import JOINTS, SQUEEZE, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.models.em2 import EM2
-from dexzoo.models.evaluator import GraspEvaluator, Scene
+from dexzoo.models.ensemble import Ensemble
+from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
 
-NUM_SCENES = len(synthetic.SPLIT_OF)
+ROOT = Path(__file__).parent.parent
 
 
 class Closure(GraspEvaluator):
@@ -32,8 +34,8 @@ class Closure(GraspEvaluator):
 
     architecture: ClassVar[str] = "closure"
 
-    def __init__(self, gain: float = 50.0) -> None:
-        super().__init__()
+    def __init__(self, gain: float = 50.0, **training: Unpack[TrainingOptions]) -> None:
+        super().__init__(**training)
         self.gain = gain
         self.head = nn.Linear(15, 1)
         nn.init.constant_(self.head.weight, gain / 15)
@@ -68,6 +70,13 @@ def data(folder: Path, tmp_path: Path) -> GraspDataModule:
 
 
 @pytest.fixture
+def ensemble(tmp_path: Path) -> Ensemble:
+    """Two members, which hold their weights in files of their own."""
+    files = [Closure(gain).save(tmp_path / f"{gain}.safetensors") for gain in (50.0, 20.0)]
+    return Ensemble(members=[str(path) for path in files]).eval()
+
+
+@pytest.fixture
 def models() -> dict[str, GraspEvaluator]:
     return {"right": Closure(), "wrong": Closure(-50.0)}
 
@@ -93,6 +102,14 @@ def test_who_knows_is_told_from_who_errs(data: GraspDataModule, models: dict[str
     against = generated["rows"]["right"]["against_gm"]["top1"]
     assert against["only_gm"] == against["neither"] == 0
     assert against["both"] + against["only_this"] == 5
+
+
+def test_the_weights_that_were_compared_are_named(data: GraspDataModule, ensemble: Ensemble, tmp_path: Path) -> None:
+    path = ensemble.save(tmp_path / "both")
+    files = [path, *(Path(member) for member in ensemble.members)]
+    sha256 = [json.loads(file.with_suffix(".json").read_text())["sha256"] for file in files]
+    result = compare(load_models([str(path), ensemble.members[0]]) | {"made": Closure()}, data)
+    assert result["weights"] == {"ensemble": sha256, "50.0": [sha256[1]], "made": [None]}
 
 
 def test_the_threshold_of_gm_comes_from_validation(data: GraspDataModule) -> None:
@@ -172,12 +189,28 @@ def test_the_folder_holds_tables_numbers_and_pictures(
 
 
 def test_the_best_of_a_column_is_bold(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
-    head, right, wrong, gm, _ = main_table(compare(models, data)["sources"]["generated"])
+    head, (right, wrong, gm, _) = main_table(compare(models, data)["sources"]["generated"])
     for name in ("accuracy", "AUROC", "top-1", "Brier"):
         assert right[head.index(name)].startswith("**"), name
         assert not wrong[head.index(name)].startswith("**"), name
     assert right[head.index("accuracy")] == "**100.0** (100.0 to 100.0)"
     assert gm[head.index("Brier")] == ""
+
+
+def test_all_are_set_against_em2_where_it_is_compared(
+    data: GraspDataModule, models: dict[str, GraspEvaluator], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "against em2" not in markdown(compare(models, data))
+    result = compare({"em_fk": models["right"], "em2": models["wrong"]}, data)
+    rows = result["sources"]["generated"]["rows"]
+    assert [name for name in rows if "against_em2" in rows[name]] == ["em_fk", "gm", "coin"]
+    assert rows["em_fk"]["against_em2"]["top1"]["failures_removed"] == {"value": 1, "interval": [1, 1]}
+    line = "| em_fk | +100.0 (+100.0 to +100.0) | +100.0 (+100.0 to +100.0) | +100.0 (+100.0 to +100.0) |"
+    line += " 0 | 5 | 0 | 0 | 0.0625 |"
+    assert markdown(result).count(line) == 2  # of generated and of perturbed grasps
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    page = runpy.run_path(str(ROOT / "benchmarks" / "evaluator_report.py"))["comparison"](result)
+    assert page.count(line) == 1
 
 
 def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
@@ -199,6 +232,12 @@ def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
     draw_inside({"em2": em2, "runs/closure": Closure()}, data, "test", tmp_path)
     names = {path.name for path in tmp_path.glob("*.png")}
     assert names == {"em2_maps.png", "em2_grasps.png", "runs_closure_grasps.png"}
+
+
+def test_what_has_nothing_inside_is_left_out(data: GraspDataModule, ensemble: Ensemble, tmp_path: Path) -> None:
+    assert grasp_features(ensemble, data.dataset("test", ensemble)) is None
+    draw_inside({"ensemble": ensemble, "right": Closure()}, data, "test", tmp_path)
+    assert {path.name for path in tmp_path.glob("*.png")} == {"right_grasps.png"}
 
 
 def test_principal_components_agree_with_scikit_learn() -> None:

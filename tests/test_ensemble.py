@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import load_file
 
 from dexzoo.camera import Observation, look_at
+from dexzoo.comparison import scores
 from dexzoo.grasp import Grasps
 from dexzoo.models import zoo
 from dexzoo.models.em_fk import EMFK
@@ -66,6 +67,19 @@ def test_a_model_alone_has_no_spread(members: list[str], view: Observation, gras
     logit, spread = prepared.logit_and_spread(grasps.waypoints)
     torch.testing.assert_close(logit, prepared.logit(grasps.waypoints))
     assert not spread.any()
+
+
+def test_the_cost_is_that_of_all_members(
+    members: list[str], view: Observation, grasps: Grasps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scores, "NUM_TIMED", 6)
+    image, waypoints = view.aimed().image()[None], grasps.waypoints
+    every = [scores.measure(zoo.load(member), image, waypoints) for member in members]
+    pair = Ensemble(members=members[:2]).save(tmp_path)
+    for ensemble in (Ensemble(members=members), Ensemble(members=[str(pair), members[2]])):
+        cost = scores.measure(ensemble.eval(), image, waypoints)
+        assert cost.parameters == sum(one.parameters for one in every)
+        assert cost.megabytes == pytest.approx(sum(one.megabytes for one in every), abs=0.2)  # each is rounded
 
 
 def test_a_saved_ensemble_is_a_list_of_members(

@@ -81,6 +81,10 @@ def test_the_cards_say_what_the_weights_and_the_benchmarks_do(monkeypatch: pytes
     cards = runpy.run_path(str(ROOT / "benchmarks" / "cards.py"))
     written = {path.stem: path.read_text() for path in (ROOT / "docs" / "cards").glob("*.md")}
     assert written == {name: cards["page"](name) for name in cards["shipped"]()}
+    for name, licence in (("hed", "MIT"), ("lite0", "Apache-2.0")):
+        assert f"| licence | {licence}, Copyright" in "\n".join(cards["trunk"]({"trunk": name}))
+    assert "Frozen trunk" in written["em2"]
+    assert "Frozen trunk" not in written["em_fk"]
 
 
 def test_the_figures_are_those_that_the_benchmarks_wrote(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sklearn import metrics as sk
 from torchmetrics.classification import BinaryCalibrationError
 
-from dexzoo.comparison.figures import NUM_BINS, against, cross_table, describe, draw_scenes, figures
+from dexzoo.comparison.figures import NUM_BINS, against, cross_table, describe, draw_scenes, figures, gains
 from dexzoo.comparison.scores import Labels, Scores, best_threshold, coin_scores, likelihood_scores
 
 
@@ -126,23 +126,40 @@ def test_the_cross_table_is_mcnemars() -> None:
     # the thesis' trials on the robot (Table 3.5): 23 good by both, 15 by the evaluator only, 5 by the generator only
     right = np.repeat([True, True, False, False], [23, 15, 5, 6])
     other = np.repeat([True, False, True, False], [23, 15, 5, 6])
-    found = cross_table(right, other)
+    found = cross_table(right, other, "gm")
     assert (found["both"], found["only_this"], found["only_gm"], found["neither"]) == (23, 15, 5, 6)
     assert found["p"] == pytest.approx(2 * sum(math.comb(20, i) for i in range(6)) / 2**20)
-    assert cross_table(right, right)["p"] == 1
+    assert cross_table(right, right, "gm")["p"] == 1
 
 
-def test_rows_are_set_against_gm_by_scene_and_by_grasp() -> None:
+def test_rows_are_set_against_another_by_scene_and_by_grasp() -> None:
     labels, scores = make(1, num_scenes=30, size=600)
-    gm = likelihood_scores(labels, labels)
+    gm, draws = likelihood_scores(labels, labels), draw_scenes(30, 0)
     assert gm is not None
-    found = against(labels, scores, gm)
-    assert sum(value for name, value in found["top1"].items() if name != "p") == 30
-    assert sum(value for name, value in found["accuracy"].items() if name != "p") == 600
+    found = against(labels, scores, gm, "gm", draws)
+    cells = ("both", "only_this", "only_gm", "neither")
+    assert sum(found["top1"][cell] for cell in cells) == 30
+    assert sum(found["accuracy"][cell] for cell in cells) == 600
     right, gm_right = scores.predicted == labels.success, gm.predicted == labels.success
     assert found["accuracy"]["only_this"] == (right & ~gm_right).sum()
     assert found["accuracy"]["only_gm"] == (gm_right & ~right).sum()
-    assert against(labels, scores, Scores(gm.score, None, None))["accuracy"] is None
+    all_own, all_other = (figures(labels, row, draws) for row in (scores, gm))
+    for name in found:
+        own, other = all_own[name], all_other[name]
+        for key, replicates in (("difference", own - other), ("failures_removed", (own - other) / (1 - other))):
+            interval = np.percentile(replicates, [2.5, 97.5])
+            np.testing.assert_allclose(found[name][key]["interval"], interval, atol=2e-6, err_msg=f"{name} {key}")
+    top1 = found["top1"]
+    removed = (top1["only_this"] - top1["only_gm"]) / (top1["only_this"] + top1["neither"])
+    assert top1["failures_removed"]["value"] == pytest.approx(removed, abs=1e-6)
+    assert against(labels, scores, Scores(gm.score, None, None), "gm", draws)["accuracy"] is None
+
+
+def test_who_never_fails_has_no_failures_to_remove() -> None:
+    right, scene = np.array([True, False, True]), np.arange(3)
+    found = gains(right, np.ones(3, bool), scene, draw_scenes(3, 0))
+    assert found["failures_removed"] == {"value": None, "interval": None}
+    assert found["difference"]["value"] == pytest.approx(-1 / 3, abs=1e-6)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 30))

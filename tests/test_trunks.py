@@ -53,6 +53,16 @@ def test_a_trunk_has_the_channels_it_claims(name: str) -> None:
         assert network(torch.zeros(1, 3, 224, 224)).shape[:2] == (1, trunks.TRUNKS[name].channels)
 
 
+def test_a_card_tells_where_a_shipped_trunk_comes_from() -> None:
+    for name in SHIPPED:
+        card = trunks.trunk_card(name)
+        assert card is not None
+        assert {"trunk", "source", "licence", "paper", "sha256"} <= set(card)
+    assert trunks.trunk_card("imagenet") is None
+    with pytest.raises(ValueError, match="trunk 'resnet' is unknown"):
+        trunks.trunk_card("resnet")
+
+
 def test_a_stranger_trunk_is_named() -> None:
     with pytest.raises(ValueError, match="trunk 'resnet' is unknown; use one of hed, imagenet"):
         EM2(trunk="resnet")

@@ -12,6 +12,7 @@ import torch
 from dexzoo.comparison.figures import NUM_DRAWS, against, describe, draw_scenes
 from dexzoo.comparison.scores import (
     COIN,
+    EM2,
     GM,
     Labels,
     Scores,
@@ -51,7 +52,8 @@ def compare(
     models: by the names of their rows. seed: of the coin and of the bootstrap's draws. The same call gives the same
     result, but for the times in `cost`.
 
-    Returns plain values, ready for JSON: split, seed, num_draws; data (version and checksum of the set); sources, for
+    Returns plain values, ready for JSON: split, seed, num_draws; data (version and checksum of the set); weights, by
+    model, checksums of its file and of its members', None for one that was not read from a file; sources, for
     generated grasps and, where the split has some, for perturbed and refined ones: how many grasps, objects and scenes,
     the success rate, and in `rows`, by name, what `figures.describe` and `figures.against` say; cost, by model. Ranks
     are within the grasps of one source in one scene, each seen in the view that the set pairs it with. There is no row
@@ -77,6 +79,7 @@ def compare(
         "seed": seed,
         "num_draws": NUM_DRAWS,
         "data": {"version": VERSION, "sha256": data.source.sha256},
+        "weights": {name: [part.sha256 for part in model.parts] for name, model in models.items()},
         "sources": {source: _section(labels[source], rows[source], validation, seed) for source in labels},
         "cost": cost,
     }
@@ -88,6 +91,7 @@ def _section(labels: Labels, rows: dict[str, Scores], validation: Labels | None,
     reference = {} if likelihood is None else {GM: likelihood}
     rows = {**rows, **reference, COIN: coin_scores(labels, seed)}
     draws = draw_scenes(labels.num_scenes, seed)
+    others = [name for name in (GM, EM2) if name in rows]
     return {
         "grasps": len(labels.success),
         "objects": len(set(labels.objects)),
@@ -95,7 +99,7 @@ def _section(labels: Labels, rows: dict[str, Scores], validation: Labels | None,
         "success_rate": float(labels.success.mean()),
         "rows": {
             name: describe(labels, scores, draws)
-            | ({"against_gm": against(labels, scores, likelihood)} if likelihood is not None and name != GM else {})
+            | {f"against_{one}": against(labels, scores, rows[one], one, draws) for one in others if one != name}
             for name, scores in rows.items()
         },
     }

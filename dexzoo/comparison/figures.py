@@ -144,30 +144,51 @@ def reliability(labels: Labels, scores: Scores) -> list[dict[str, Any]] | None:
     ]
 
 
-def against(labels: Labels, scores: Scores, other: Scores) -> dict[str, Any]:
-    """How often a row and another, gm, are right where the other is wrong, with McNemar's exact test of the difference.
+def against(labels: Labels, scores: Scores, other: Scores, name: str, draws: Array) -> dict[str, Any]:
+    """How a row does where another of the given name does, too: what `cross_table` and `gains` say.
 
     top1: over scenes, whether the first grasp holds, as the thesis counts (Table 3.4). accuracy: over grasps, whether
     the prediction is right; grasps of a scene are alike, so that its p is too small. None without thresholds.
     """
-    found: dict[str, Any] = {}
+    scenes = np.arange(labels.num_scenes)
     first, other_first = (by_scene(TopKSuccess(1), labels, row) > 0.5 for row in (scores, other))
-    found["top1"] = cross_table(first, other_first)
+    found: dict[str, Any] = {"top1": cross_table(first, other_first, name) | gains(first, other_first, scenes, draws)}
     found["accuracy"] = None
     if scores.predicted is not None and other.predicted is not None:
-        found["accuracy"] = cross_table(scores.predicted == labels.success, other.predicted == labels.success)
+        right, other_right = scores.predicted == labels.success, other.predicted == labels.success
+        found["accuracy"] = cross_table(right, other_right, name) | gains(right, other_right, labels.scene, draws)
     return found
 
 
-def cross_table(right: NDArray[np.bool_], other_right: NDArray[np.bool_]) -> dict[str, Any]:
-    """The four cells, and McNemar's exact p: of a split at least as uneven among the cases in which they differ."""
+def gains(
+    right: NDArray[np.bool_], other_right: NDArray[np.bool_], scene: NDArray[np.int64], draws: Array
+) -> dict[str, Any]:
+    """What a row gains over another on the same cases, with intervals over the same draws.
+
+    right, other_right, scene: (case,). difference: of the rates at which they are right. failures_removed: the share of
+    the other's failures that are gone, less those that are new; negative where there are more.
+    """
+    once = np.ones((1, draws.shape[1]))
+    columns = (right * 1.0 - other_right, np.ones(len(right)), ~other_right)
+    gained, cases, failures = (np.bincount(scene, column, draws.shape[1]) for column in columns)
+    return {
+        name: with_interval(*(_ratio(weights @ gained, weights @ whole) for weights in (once, draws)))
+        for name, whole in (("difference", cases), ("failures_removed", failures))
+    }
+
+
+def cross_table(right: NDArray[np.bool_], other_right: NDArray[np.bool_], name: str) -> dict[str, Any]:
+    """The four cells, and McNemar's exact p: of a split at least as uneven among the cases in which they differ.
+
+    name: of the other.
+    """
     alone, other_alone = int((right & ~other_right).sum()), int((~right & other_right).sum())
     differ = alone + other_alone
     return {
         "both": int((right & other_right).sum()),
         "neither": int((~right & ~other_right).sum()),
         "only_this": alone,
-        "only_gm": other_alone,
+        f"only_{name}": other_alone,
         "p": float(binomtest(alone, differ).pvalue) if differ else 1.0,
     }
 

@@ -27,7 +27,7 @@ _COLUMNS = 5
 
 
 def draw_inside(models: Mapping[str, GraspEvaluator], data: GraspDataModule, split: str, folder: Path) -> None:
-    """Write NAME_maps.png, for models that have feature maps, and NAME_grasps.png into a folder."""
+    """Write NAME_maps.png and NAME_grasps.png into a folder, each for the models that have what it shows."""
     image = first_image(data, split)
     for name, model in models.items():
         stem = name.strip("/").replace("/", "_")
@@ -35,10 +35,12 @@ def draw_inside(models: Mapping[str, GraspEvaluator], data: GraspDataModule, spl
         if maps is not None:
             save(maps_picture(image, maps), folder / f"{stem}_maps.png")
         dataset = data.dataset(split, model)
-        rows, features = grasp_features(model, dataset)
-        where = "after the hand branch" if BRANCH in dict(model.named_modules()) else "before the last layer"
-        picture = components_picture(dataset.aimed(rows), features, dataset.success[rows] > 0.5, where)
-        save(picture, folder / f"{stem}_grasps.png")
+        found = grasp_features(model, dataset)
+        if found is not None:
+            rows, features = found
+            where = "after the hand branch" if BRANCH in dict(model.named_modules()) else "before the last layer"
+            picture = components_picture(dataset.aimed(rows), features, dataset.success[rows] > 0.5, where)
+            save(picture, folder / f"{stem}_grasps.png")
 
 
 @torch.no_grad()
@@ -51,11 +53,14 @@ def feature_maps(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"]) -> 
 
 
 @torch.no_grad()
-def grasp_features(model: GraspEvaluator, dataset: GraspDataset) -> tuple[Tensor, Float[Tensor, "grasp feature"]]:
+def grasp_features(
+    model: GraspEvaluator, dataset: GraspDataset
+) -> tuple[Tensor, Float[Tensor, "grasp feature"]] | None:
     """What a model makes of about a thousand grasps: their rows, and the features.
 
     Features are the output of the module `hand_branch`, or, in a model without, what its last linear layer is given,
-    where grasp and image are already joined.
+    where grasp and image are already joined. None where grasps pass neither, as in an ensemble, whose members are no
+    modules of its own.
     """
     branch = dict(model.named_modules()).get(BRANCH)
     linear: list[nn.Module] = [module for module in model.modules() if isinstance(module, nn.Linear)]
@@ -66,6 +71,8 @@ def grasp_features(model: GraspEvaluator, dataset: GraspDataset) -> tuple[Tensor
             if i % step == 0:
                 recorded.clear()
                 model.logit(scene, dataset.aimed(part)[None].to(model.device))
+                if not recorded:
+                    return None
                 rows.append(part)
                 features.append(recorded[-1].float().cpu().reshape(len(part), -1))
     return torch.cat(rows), torch.cat(features)

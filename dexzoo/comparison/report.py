@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,9 +12,14 @@ from rich import box
 from rich.table import Table
 
 from dexzoo.comparison.charts import draw_charts
+from dexzoo.comparison.scores import EM2, GM
 
-Cells = list[list[str]]
-"""A table: its head, then its rows."""
+
+class Cells(NamedTuple):
+    """A table."""
+
+    head: list[str]
+    rows: list[list[str]]
 
 
 class _Column(NamedTuple):
@@ -37,7 +43,6 @@ _COLUMNS = {
 }
 _BRIEF = ("accuracy", "auroc", "scene_auroc", "calibration_error", "top1", "top5")
 _COUNTS = {"tp": "tp", "fp": "fp", "tn": "tn", "fn": "fn"}
-_CROSS = {"both": "both hold", "only_this": "only this", "only_gm": "only gm", "neither": "neither"}
 _COST = {
     "parameters": "parameters",
     "megabytes": "MB",
@@ -52,6 +57,10 @@ precision; Brier score and expected calibration error, the lower the better. 95 
 p: McNemar's exact test of top-1 against gm, the generator's own order, whose threshold was chosen on validation. The
 best of each column is bold.
 """
+AGAINST_EM2 = """\
+What each gains over em2 on the same grasps: points of accuracy and of top-1, and how many % of em2's failures in top-1
+it removes, less those that it adds. Then in how many scenes whose first grasp holds, and McNemar's exact p.
+"""
 
 
 def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
@@ -61,7 +70,7 @@ def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
     """
     rows: dict[str, Any] = section["rows"]
     columns = {name: column for name, column in _COLUMNS.items() if not brief or name in _BRIEF}
-    table = [["", *(column.heading for column in columns.values()), "p"]]
+    found = Cells(["", *(column.heading for column in columns.values()), "p"], [])
     best = {name: _best([row["figures"].get(name) for row in rows.values()], name) for name in columns}
     for label, row in rows.items():
         cells = []
@@ -73,14 +82,14 @@ def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
             if column.with_interval and not brief and figure.get("interval"):
                 cell += " ({} to {})".format(*(_number(end, column) for end in figure["interval"]))
             cells.append(cell)
-        table.append([label, *cells, _p(row.get("against_gm", {}).get("top1"))])
-    return table
+        found.rows.append([label, *cells, _p(row.get("against_gm", {}).get("top1"))])
+    return found
 
 
 def terminal_table(result: dict[str, Any]) -> Table:
     """The main table of the first source, the generated grasps, for a terminal of 80 columns."""
     source, section = next(iter(result["sources"].items()))
-    head, *rows = main_table(section, brief=True)
+    head, rows = main_table(section, brief=True)
     shown = Table(*head, title=title(source, section), box=box.SIMPLE)
     for row in rows:
         shown.add_row(*(re.sub(r"\*\*(.*?)\*\*", r"[bold]\1[/bold]", cell) for cell in row))
@@ -89,17 +98,31 @@ def terminal_table(result: dict[str, Any]) -> Table:
 
 def counts_table(section: dict[str, Any]) -> Cells:
     """True and false positives and negatives (thesis, Table 3.3), and the cross table of top-1 with gm (Table 3.4)."""
-    table = [["", *_COUNTS.values(), *_CROSS.values()]]
+    names = _cross(GM)
+    found = Cells(["", *_COUNTS.values(), *names.values()], [])
     for label, row in section["rows"].items():
         counts, cross = row["counts"] or {}, row.get("against_gm", {}).get("top1", {})
-        cells = [*(counts.get(name) for name in _COUNTS), *(cross.get(name) for name in _CROSS)]
-        table.append([label, *("" if cell is None else f"{cell:,}" for cell in cells)])
-    return table
+        cells = [*(counts.get(name) for name in _COUNTS), *(cross.get(name) for name in names)]
+        found.rows.append([label, *("" if cell is None else f"{cell:,}" for cell in cells)])
+    return found
+
+
+def against_em2(section: dict[str, Any]) -> list[str]:
+    """What each row gains over em2 and the cross table of top-1, in Markdown; nothing where em2 is not compared."""
+    names = _cross(EM2)
+    rows = []
+    for label, row in section["rows"].items():
+        if "against_em2" in row:
+            accuracy, top1 = (row["against_em2"][name] for name in ("accuracy", "top1"))
+            gains = [accuracy and accuracy["difference"], top1["difference"], top1["failures_removed"]]
+            rows.append([label, *map(_gain, gains), *(f"{top1[name]:,}" for name in names), _p(top1)])
+    head = ["against em2", "accuracy", "top-1", "failures removed", *names.values(), "p"]
+    return [AGAINST_EM2, table(head, rows)] if rows else []
 
 
 def cost_table(cost: dict[str, dict[str, Any]]) -> Cells:
     """Size and speed of the models."""
-    return [["", *_COST.values()], *([label, *(f"{row[name]:,}" for name in _COST)] for label, row in cost.items())]
+    return Cells(["", *_COST.values()], [[label, *(f"{row[name]:,}" for name in _COST)] for label, row in cost.items()])
 
 
 def title(source: str, section: dict[str, Any]) -> str:
@@ -114,15 +137,16 @@ def markdown(result: dict[str, Any]) -> str:
     """The whole comparison: for each source the main table and the counts, then the cost."""
     parts = [f"# Comparison on the {result['split']} split\n", NOTES]
     for source, section in result["sources"].items():
-        parts += [f"## {title(source, section)}\n", table(main_table(section)), table(counts_table(section))]
-    parts += ["## Cost\n", table(cost_table(result["cost"]))]
+        parts += [f"## {title(source, section)}\n", table(*main_table(section)), table(*counts_table(section))]
+        parts += against_em2(section)
+    parts += ["## Cost\n", table(*cost_table(result["cost"]))]
     return "\n".join(parts)
 
 
-def table(cells: Cells) -> str:
-    """Cells in Markdown."""
-    lines = [f"| {' | '.join(row)} |" for row in cells]
-    return "\n".join([lines[0], "|" + "---|" * len(cells[0]), *lines[1:]]) + "\n"
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    first, *others = (f"| {' | '.join(map(str, row))} |" for row in (head, *rows))
+    return "\n".join([first, "|" + "---|" * len(head), *others]) + "\n"
 
 
 def write(result: dict[str, Any], folder: Path) -> None:
@@ -140,6 +164,16 @@ def _best(figures: list[dict[str, Any] | None], name: str) -> float | None:
 
 def _number(value: float | None, column: _Column) -> str:
     return "" if value is None else f"{column.scale * value:.{column.digits}f}"
+
+
+def _cross(other: str) -> dict[str, str]:
+    return {"both": "both hold", "only_this": "only this", f"only_{other}": f"only {other}", "neither": "neither"}
+
+
+def _gain(figure: dict[str, Any] | None) -> str:
+    if figure is None or figure["value"] is None:
+        return ""
+    return "{:+.1f} ({:+.1f} to {:+.1f})".format(*(100 * x for x in (figure["value"], *figure["interval"])))
 
 
 def _p(cross: dict[str, Any] | None) -> str:

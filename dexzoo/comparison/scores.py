@@ -23,6 +23,8 @@ from dexzoo.models.evaluator import CHUNK, GraspEvaluator, Scene
 
 GM, COIN = "gm", "coin"
 """The rows that every comparison has: the generative model, ranking by its own likelihood, and chance."""
+EM2 = "em2"
+"""The thesis' evaluator, which the other rows are set against where it is compared."""
 NUM_TIMED = 1000
 _REPEATS = 3
 
@@ -82,8 +84,9 @@ class Cost:
     """What a model takes.
 
     parameters: those trained; the frozen trunk, shared by models, has its own. megabytes: of its weights as `save`
-    writes them, without the trunk. milliseconds_per_view, milliseconds_per_1000_grasps: best of three on `threads`
-    threads; the view is encoded by the trunk and all, the grasps are scored on one view.
+    writes them, without the trunk. An ensemble's members count in both. milliseconds_per_view,
+    milliseconds_per_1000_grasps: best of three on `threads` threads; the view is encoded by the trunk and all, the
+    grasps are scored on one view.
     """
 
     parameters: int
@@ -180,9 +183,9 @@ def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: 
     view = _best_time(lambda: model.encode(image))
     scoring = _best_time(lambda: [model.logit(scene, part[None]) for part in grasps.split(CHUNK)])
     with tempfile.TemporaryDirectory() as folder:
-        size = model.save(Path(folder)).stat().st_size
+        size = sum(part.save(Path(folder)).stat().st_size for part in model.parts)
     return Cost(
-        sum(parameter.numel() for parameter in model.parameters()),
+        sum(parameter.numel() for part in model.parts for parameter in part.parameters()),
         round(size / 1e6, 1),
         round(1000 * view, 1),
         round(1000 * scoring, 1),

@@ -31,6 +31,11 @@ class Ensemble(GraspEvaluator):
         # in a tuple, out of the way of state_dict, since each has its own file; they follow what they are given
         self._loaded = tuple(load(member).requires_grad_(False) for member in self.members)
 
+    @property
+    def parts(self) -> tuple[GraspEvaluator, ...]:
+        """Itself and its members; those of a member that is an ensemble too."""
+        return (self, *(part for member in self._loaded for part in member.parts))
+
     def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
         """What each member keeps, under its number."""
         scenes = [member.to(images).encode(images) for member in self._loaded]

@@ -99,6 +99,8 @@ class GraspEvaluator(LightningModule):
     architecture: ClassVar[str]
     temperature: Tensor
     offset: Tensor
+    sha256: str | None = None
+    """Of the file that `dexzoo.load` read; None for a model that was made otherwise."""
     frozen_encoder: ClassVar[bool] = False
     """Whether `encode` has nothing to train, so that its result can be kept for the next epoch and on disk."""
 
@@ -152,6 +154,11 @@ class GraspEvaluator(LightningModule):
 
     def fit_statistics(self, images: Float[Tensor, "view 2 224 224"], waypoints: Float[Tensor, "grasp 10 28"]) -> None:
         """Set what is standardised by the training data; called once, before training. Nothing by default."""
+
+    @property
+    def parts(self) -> tuple[GraspEvaluator, ...]:
+        """All evaluators that take part, each with a file of its own: this one, and an ensemble's members."""
+        return (self,)
 
     @property
     def arguments(self) -> dict[str, Any]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -23,12 +24,15 @@ LITE0_BLOCKS = (
 
 
 class Trunk(NamedTuple):
-    """channels: of its last feature map. scale: standard deviation of the images it was trained on."""
+    """channels: of its last feature map. scale: standard deviation of the images it was trained on.
+
+    weights: the name of a file that comes with dexzoo, or what gives them.
+    """
 
     channels: int
     scale: float
     build: Callable[[], nn.Module]
-    weights: Callable[[], dict[str, Tensor]]
+    weights: str | Callable[[], dict[str, Tensor]]
 
 
 def _vgg16() -> nn.Module:
@@ -98,11 +102,11 @@ def _fetched(weights: WeightsEnum, *, prefix: str = "", without: str) -> dict[st
 _VGG = partial(_fetched, VGG16_Weights.IMAGENET1K_V1, prefix="features.", without="classifier.")
 _RESNET = partial(_fetched, ResNet50_Weights.IMAGENET1K_V2, without="fc.")
 TRUNKS = {
-    "hed": Trunk(512, 60.0, _vgg16, partial(_shipped, "vgg16_hed")),
+    "hed": Trunk(512, 60.0, _vgg16, "vgg16_hed"),
     "imagenet": Trunk(512, 1.0, _vgg16, _VGG),
-    "lite0": Trunk(1280, 0.5, efficientnet_lite0, partial(_shipped, "efficientnet_lite0")),
+    "lite0": Trunk(1280, 0.5, efficientnet_lite0, "efficientnet_lite0"),
     "resnet50": Trunk(2048, 1.0, _resnet50, _RESNET),
-    "resnet50_views": Trunk(2048, 1.0, _resnet50, partial(_shipped, "resnet50_views")),
+    "resnet50_views": Trunk(2048, 1.0, _resnet50, "resnet50_views"),
 }
 """hed: VGG-16, ImageNet weights fine-tuned for edge detection (Xie and Tu 2015). imagenet: VGG-16, fetched by
 torchvision. lite0: EfficientNet-lite0, ImageNet. resnet50: ImageNet, fetched by torchvision. resnet50_views: ResNet-50
@@ -116,6 +120,18 @@ def trunk(name: str) -> Trunk:
     return TRUNKS[name]
 
 
+def trunk_card(name: str) -> dict[str, Any] | None:
+    """What the card of a trunk that comes with dexzoo says, such as source and licence; None for one that is fetched.
+
+    Raises ValueError for another name, FileNotFoundError for one that does not come yet.
+    """
+    file = trunk(name).weights
+    if not isinstance(file, str):
+        return None
+    card: dict[str, Any] = json.loads((resource("checkpoints") / f"{file}.json").read_text())
+    return card
+
+
 @lru_cache(maxsize=2)
 def load_trunk(name: str) -> nn.Module:
     """A trunk with its weights, frozen; one copy of each is shared by all models.
@@ -123,7 +139,7 @@ def load_trunk(name: str) -> nn.Module:
     Raises ValueError for another name, FileNotFoundError where weights cannot be had.
     """
     known = trunk(name)
-    weights = known.weights()
+    weights = _shipped(known.weights) if isinstance(known.weights, str) else known.weights()
     with torch.device("meta"):  # torchvision would draw millions of random weights that nobody needs
         network = known.build()
     network.load_state_dict(

@@ -132,7 +132,8 @@ def _read(path: Path) -> GraspEvaluator:
         weights = load_file(path)
     except SafetensorError as error:
         raise ValueError(f"{path} is truncated or not a safetensors file ({error}); fetch or save it again") from None
-    if hashlib.sha256(path.read_bytes()).hexdigest() != card.get("sha256"):
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    if sha256 != card.get("sha256"):
         raise ValueError(f"{path} does not match the sha256 in its card; fetch or save both again")
     cls = model_class(card["architecture"])
     try:
@@ -140,6 +141,7 @@ def _read(path: Path) -> GraspEvaluator:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path.with_suffix('.json')}: {cls.__name__} refuses its arguments: {error}") from None
     load_weights(evaluator, weights, path)
+    evaluator.sha256 = sha256
     return evaluator.eval()
 
 
