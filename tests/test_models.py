@@ -5,6 +5,7 @@ import runpy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import synthetic
@@ -522,8 +523,18 @@ def test_names_and_places_that_do_not_exist(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_hub_repository_is_a_folder(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    hub = pytest.importorskip("huggingface_hub")
     asked = []
-    monkeypatch.setattr(hub, "snapshot_download", lambda name, **_: asked.append(name) or str(saved.parent))
-    assert isinstance(zoo.load("hf://someone/em2"), EM2)
-    assert asked == ["someone/em2"]
+
+    def fetch(name: str, allow_patterns: list[str]) -> str:
+        asked.append((name, allow_patterns))
+        if name == "someone/none":
+            raise OSError("no such repository\nsee the documentation")
+        return str(saved.parent)
+
+    # what stands in for the package and its network
+    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=fetch))
+    loaded = zoo.load("hf://someone/em2").state_dict()
+    assert all(torch.equal(value, loaded[name]) for name, value in zoo.load(saved).state_dict().items())
+    assert asked == [("someone/em2", ["*.safetensors", "*.json"])]
+    with pytest.raises(FileNotFoundError, match=r"^hf://someone/none cannot be fetched: no such repository$"):
+        zoo.load("hf://someone/none")
