@@ -236,6 +236,8 @@ def main(args: list[str]) -> None:
 
 def _reason(error: Exception) -> str:
     """The one line that matters of an error; jsonargparse lists, each after a dash, why no type of several fits."""
+    if "`tensorboard`" in str(error):  # Lightning's three lines name two packages
+        return "TensorBoardLogger needs tensorboard; install it with `pip install dexzoo[tensorboard]`"
     whole, *reasons = [" ".join(part.split()) for part in re.split(r"\n\s*- ", str(error))]
     reasons = [reason for reason in reasons if "NoneType" not in reason]
     return (reasons[0] if reasons else whole)[:400]

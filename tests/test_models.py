@@ -428,6 +428,16 @@ def test_calls_that_are_wrong_get_one_line(arguments: list[str], tmp_path: Path)
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.usefixtures("here")
+def test_a_logger_without_its_package_says_how_to_get_it(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in ("_TENSORBOARD_AVAILABLE", "_TENSORBOARDX_AVAILABLE"):
+        monkeypatch.setattr(f"lightning.fabric.loggers.tensorboard.{package}", False)
+    for name in ("TensorBoardLogger", "lightning.pytorch.loggers.TensorBoardLogger"):
+        with pytest.raises(ValueError, match=r"needs tensorboard; .*`pip install dexzoo\[tensorboard\]`$") as caught:
+            training.main(["fit", *SMOKE, *arguments, f"--trainer.logger={name}"])
+        assert "\n" not in str(caught.value)
+
+
 def test_help_ends_well(capsys: pytest.CaptureFixture[str]) -> None:
     for args in (["fit", "--help"], ["--help"]):
         with pytest.raises(SystemExit) as caught:
