@@ -20,6 +20,7 @@ import torch
 from torchmetrics.functional.classification import binary_auroc
 
 import dexzoo
+from dexzoo.comparison.compare import GENERATED
 from dexzoo.comparison.figures import figures
 from dexzoo.comparison.scores import model_scores, read_labels
 from dexzoo.data.datamodule import GraspDataModule
@@ -28,7 +29,6 @@ from dexzoo.models.zoo import load_weights
 from dexzoo.resources import resource
 from dexzoo.training import read_checkpoint
 
-GENERATED = "generated"
 TOLERANCE = 0.001
 """A tenth of a point."""
 SMALL_PART = 6

@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from dexzoo.comparison.compare import load_models
+from dexzoo.comparison.compare import GENERATED, load_models
 from dexzoo.comparison.figures import draw_scenes, figures_with_intervals
 from dexzoo.comparison.scores import Scores, model_scores, read_labels, rows_of
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
 
-GENERATED = "generated"
 ALL, OTHERS, UNDISTURBED = (
     "the rate of all its trials",
     "the rate of its other trials",

@@ -128,6 +128,9 @@ class CommandLine(LightningCLI):
 
     def predict(self, ckpt_path: str | None, **_: object) -> None:
         """Probabilities of success of one split's grasps, in the order of the set, to predictions.json in the run."""
+        processes = self.trainer.world_size
+        if processes > 1:  # each would write its own share of the grasps to the one file
+            raise ValueError(f"one process does it, not {processes}; give --trainer.devices 1 --trainer.num_nodes 1")
         self._load(ckpt_path)
         batches = self.trainer.predict(self.model, datamodule=self.datamodule) or []
         path = Path(self.trainer.log_dir or ".") / "predictions.json"
@@ -162,6 +165,9 @@ class CommandLine(LightningCLI):
         return {"data": data, "trainer": trainer}
 
     def _report(self, results: dict[str, Any]) -> None:
+        """Write results to standard output, once however many processes there are."""
+        if not self.trainer.is_global_zero:
+            return
         if self._get(self.config, "json"):
             sys.stdout.write(json.dumps(results) + "\n")
             return
@@ -236,6 +242,8 @@ def main(args: list[str]) -> None:
 
 def _reason(error: Exception) -> str:
     """The one line that matters of an error; jsonargparse lists, each after a dash, why no type of several fits."""
+    if "`tensorboard`" in str(error):  # Lightning's three lines name two packages
+        return "TensorBoardLogger needs tensorboard; install it with `pip install dexzoo[tensorboard]`"
     whole, *reasons = [" ".join(part.split()) for part in re.split(r"\n\s*- ", str(error))]
     reasons = [reason for reason in reasons if "NoneType" not in reason]
     return (reasons[0] if reasons else whole)[:400]

@@ -5,6 +5,7 @@ import runpy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import synthetic
@@ -420,10 +421,21 @@ def test_calls_that_are_wrong_get_one_line(arguments: list[str], tmp_path: Path)
     wrong.append((["test", *SMOKE, *arguments, "--ckpt_path", str(bad)], "is not what fit writes, refused"))
     EM2(width=8).save(tmp_path / "narrow.safetensors")
     other = ["test", *SMOKE, *arguments, "--ckpt_path", str(tmp_path / "narrow.safetensors")]
-    wrong.append((other, "holds another architecture than em2 as configured"))
+    sizes = r"narrow\.safetensors holds another architecture than em2 .*, 8 in the file and 64 as configured"
+    wrong.append((other, sizes))
     for args, message in wrong:
         with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
             training.main(args)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("here")
+def test_a_logger_without_its_package_says_how_to_get_it(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in ("_TENSORBOARD_AVAILABLE", "_TENSORBOARDX_AVAILABLE"):
+        monkeypatch.setattr(f"lightning.fabric.loggers.tensorboard.{package}", False)
+    for name in ("TensorBoardLogger", "lightning.pytorch.loggers.TensorBoardLogger"):
+        with pytest.raises(ValueError, match=r"needs tensorboard; .*`pip install dexzoo\[tensorboard\]`$") as caught:
+            training.main(["fit", *SMOKE, *arguments, f"--trainer.logger={name}"])
         assert "\n" not in str(caught.value)
 
 
@@ -522,8 +534,18 @@ def test_names_and_places_that_do_not_exist(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_hub_repository_is_a_folder(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    hub = pytest.importorskip("huggingface_hub")
     asked = []
-    monkeypatch.setattr(hub, "snapshot_download", lambda name, **_: asked.append(name) or str(saved.parent))
-    assert isinstance(zoo.load("hf://someone/em2"), EM2)
-    assert asked == ["someone/em2"]
+
+    def fetch(name: str, allow_patterns: list[str]) -> str:
+        asked.append((name, allow_patterns))
+        if name == "someone/none":
+            raise OSError("no such repository\nsee the documentation")
+        return str(saved.parent)
+
+    # what stands in for the package and its network
+    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=fetch))
+    loaded = zoo.load("hf://someone/em2").state_dict()
+    assert all(torch.equal(value, loaded[name]) for name, value in zoo.load(saved).state_dict().items())
+    assert asked == [("someone/em2", ["*.safetensors", "*.json"])]
+    with pytest.raises(FileNotFoundError, match=r"^hf://someone/none cannot be fetched: no such repository$"):
+        zoo.load("hf://someone/none")

@@ -12,6 +12,7 @@ from safetensors.torch import load_file
 
 from dexzoo import training
 from dexzoo.models import zoo
+from dexzoo.resources import resource
 
 ROOT = Path(__file__).parent.parent
 SHIPPED = [name for name in zoo.list_models() if zoo.shipped_card(name)]
@@ -37,6 +38,12 @@ def test_shipped_weights_reproduce_the_auroc_in_their_card(name: str, release: A
     assert found | {"auroc": 0} == expected | {"auroc": 0}, how
     # trunks run in bfloat16, whose sums differ between processors
     assert found["auroc"] == pytest.approx(expected["auroc"], abs=0.005)
+
+
+def test_a_clone_brings_at_most_200_mb_of_weights() -> None:
+    sizes = {path.name: path.stat().st_size for path in resource("checkpoints").glob("*.safetensors")}
+    assert sizes.keys() >= {f"{name}.safetensors" for name in SHIPPED}
+    assert sum(sizes.values()) <= 200e6, sizes
 
 
 def test_a_run_is_shipped_in_half_precision_where_no_figure_moves(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import synthetic
 import torch
+from lightning.pytorch import Trainer
 from safetensors.torch import load_file
 
 import dexzoo
@@ -25,6 +26,7 @@ STEPS = [
     "--trainer.val_check_interval=3",
     "--trainer.max_steps=12",
 ]
+TWO_PROCESSES = ["--trainer.accelerator=cpu", "--trainer.devices=2", "--trainer.strategy=ddp"]
 
 
 @pytest.fixture(scope="module")
@@ -181,13 +183,30 @@ def test_calibration_needs_both_outcomes_and_survives_the_perfect() -> None:
     assert float(model.temperature) > 0
 
 
+def test_one_process_predicts(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training.CommandLine, "_load", None)  # refused before any work, and before the second process
+    for more in (TWO_PROCESSES, ["--trainer.accelerator=cpu", "--trainer.devices=1", "--trainer.num_nodes=2"]):
+        with pytest.raises(ValueError, match=r"^predict: one process does it, not 2; give --trainer\.devices 1 "):
+            training.main(["predict", *arguments[1:], *more])
+
+
+@pytest.mark.parametrize("command", ["validate", "test"])
+def test_the_first_of_several_processes_reports(
+    command: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training.main([command, *arguments[1:]])
+    assert json.loads(capsys.readouterr().out).keys() >= {f"{command.replace('validate', 'validation')}_auroc"}
+    monkeypatch.setattr(Trainer, "is_global_zero", False)
+    training.main([command, *arguments[1:]])
+    assert capsys.readouterr().out == ""
+
+
 @pytest.mark.slow
 def test_two_processes_learn_as_one(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     dry = ["--model.dropout=0", "--trainer.precision=32"]  # each process draws its own dropout
     training.main([*arguments, *dry])
     one = json.loads(capsys.readouterr().out)["metrics"]
-    two = ["--trainer.accelerator=cpu", "--trainer.devices=2", "--trainer.strategy=ddp"]
-    command = [sys.executable, "-m", "dexzoo", *arguments, *dry, *two]
+    command = [sys.executable, "-m", "dexzoo", *arguments, *dry, *TWO_PROCESSES]
     environment = {**os.environ, "PYTHONPATH": str(Path(dexzoo.__file__).parent.parent)}
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
     assert done.returncode == 0, done.stderr

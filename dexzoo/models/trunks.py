@@ -84,10 +84,15 @@ def efficientnet_lite0() -> nn.Module:
     return nn.Sequential(*layers, nn.Conv2d(channels, 1280, 1), nn.ReLU6())
 
 
+_MADE_HERE = {"resnet50_views": "assets/checkpoints/train_resnet50.py"}
+"""Files that do not come with dexzoo, and what makes them."""
+
+
 def _shipped(name: str) -> dict[str, Tensor]:
     path = resource("checkpoints") / f"{name}.safetensors"
     if not path.is_file():
-        raise FileNotFoundError(f"trunk weights {path} are missing; use another trunk, or reinstall dexzoo")
+        remedy = f"make them by `python {_MADE_HERE[name]}`" if name in _MADE_HERE else "reinstall dexzoo"
+        raise FileNotFoundError(f"trunk weights {path} are missing; use another trunk, or {remedy}")
     return load_file(path)
 
 
@@ -110,7 +115,7 @@ TRUNKS = {
 }
 """hed: VGG-16, ImageNet weights fine-tuned for edge detection (Xie and Tu 2015). imagenet: VGG-16, fetched by
 torchvision. lite0: EfficientNet-lite0, ImageNet. resnet50: ImageNet, fetched by torchvision. resnet50_views: ResNet-50
-trained here on rendered views. All but the fetched come with dexzoo."""
+trained on rendered views by assets/checkpoints/train_resnet50.py. All but the fetched and the last come with dexzoo."""
 
 
 def trunk(name: str) -> Trunk:
