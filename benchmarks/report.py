@@ -31,6 +31,7 @@ def summary() -> str:
     generated = read("comparison")["sources"]["generated"]
     best, gm = (generated["rows"][name]["figures"] for name in ("em_fk", "gm"))
     method = read("refinement")["variants"]["method"]
+    first = method["top1"]["before"]
 
     def of_hundred(figure: dict[str, Any]) -> str:
         return rate(figure | {"rate": figure["value"]})
@@ -50,6 +51,12 @@ def summary() -> str:
         ),
         ("the same grasps refined", rate(method["success_after"])),
         ("change", points(method["change"])),
+        ("the first of each scene in the order of `em_fk`, as generated", rate(first["unrefined"])),
+        ("the same, refined", rate(first["refined"])),
+        (
+            "grasps that would hit the table or a block, as generated and refined",
+            f"{method['collided_before']} and {method['collided_after']}",
+        ),
     ]
     return table(("what, on test objects", "figure (95 % interval over scenes)"), rows)
 

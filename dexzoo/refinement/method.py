@@ -80,7 +80,7 @@ def refine(
     an Observation. evaluator: what guides: a model, or what `dexzoo.load` takes.
     judge: another such, which does not guide, but must find the log-odds of a refined grasp higher by more than
     `margin` for it to be accepted. With or without one, the objective must rise, and, where the table has a weight, the
-    whole way to the grip must lack no more of its clearance than before.
+    whole way to the grip must lack at most a millimetre more of its clearance than before.
     optimiser, num_steps, step_size: how many states are evaluated besides the first of each half; a step moves a number
     by about `step_size` of its half of the trust region. The first half of the steps moves the wrist, the second the
     fingers.

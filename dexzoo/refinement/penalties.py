@@ -35,7 +35,7 @@ class Surroundings:
     """The points around a view that a hand should not be in, in the world frame.
 
     observed: of the object. shadow: behind them. others: of what else is seen on the table, or guessed to carry the
-    object.
+    object where the view does not see it free.
     """
 
     def __init__(self, observation: Observation) -> None:
@@ -46,7 +46,9 @@ class Surroundings:
         sight = torch.nn.functional.normalize(some - camera, dim=-1)
         behind = torch.cat([some + depth * sight for depth in SHADOW_DEPTHS])
         self.shadow = behind[behind[:, 2] > 0]
-        self.others = torch.cat((obstacles(observation), underneath(points)))
+        guess = underneath(points)
+        hidden = guess[torch.from_numpy(~observation.would_see(guess.numpy()))]
+        self.others = torch.cat((obstacles(observation), hidden))
 
 
 def _evenly(points: Tensor, num: int) -> Tensor:
@@ -78,12 +80,15 @@ class Posed:
         """Metres that the deepest point lies in each link, summed over links and moments."""
         return (-self.distance(near, AT_OBJECT).amin(-1)).clamp_min(0).sum((-1, -2))
 
-    def table(self, near: Float[Tensor, "#grasp #moment near 3"]) -> Float[Tensor, " grasp"]:
-        """Metres that each link lacks of its clearance from the table and what stands on it, summed likewise."""
+    def table(self, near: Float[Tensor, "#grasp #moment near 3"], around: float = 0.0) -> Float[Tensor, " grasp"]:
+        """Metres that each link lacks of its clearance from the table and what stands on it, summed likewise.
+
+        around: metres about each point that belong to what stands there.
+        """
         # the third row of a pose is the table's plane in the palm frame
         clearance = self.hand.clearance(self.links, self.wrist[..., 2, :])
         if near.shape[-2]:
-            clearance = torch.minimum(clearance, self.distance(near).amin(-1))
+            clearance = torch.minimum(clearance, self.distance(near).amin(-1) - around)
         return (MIN_CLEARANCE - clearance).clamp_min(0).sum((-1, -2))
 
     def self_collision(self) -> Float[Tensor, " grasp"]:
