@@ -24,7 +24,7 @@ from torch.nn import functional as F
 
 from dexzoo.data.grasp_set import GraspSet
 from dexzoo.data.schema import VERSION
-from dexzoo.models.encoders import DepthEncoder
+from dexzoo.models.encoders import DepthEncoder, has_bfloat16
 from dexzoo.models.trunks import TRUNKS
 from dexzoo.models.view_geometry import view_geometry
 
@@ -81,7 +81,7 @@ def train(data: GraspSet, split: str, epochs: int, batch_size: int, seed: int) -
             x, (normals, mask) = encoder.standardise(seen), targets(seen)
             if rng.random() < 0.5:
                 x, normals, mask = x.flip(-1), normals.flip(-1) * torch.tensor([-1, 1, 1])[:, None, None], mask.flip(-1)
-            with torch.autocast("cpu", torch.bfloat16):
+            with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16(torch.device("cpu"))):
                 loss, share = task.loss(x, category[views[rows]], normals, mask)
             optimiser.zero_grad()
             loss.backward()
