@@ -49,6 +49,7 @@ _COST = {
     "milliseconds_per_view": "ms a view",
     "milliseconds_per_1000_grasps": "ms for 1,000 grasps",
     "threads": "threads",
+    "processor": "processor",
 }
 NOTES = """\
 Accuracy, balanced accuracy (the mean of the rates at which successes and failures are recognised) and success of the
@@ -122,7 +123,11 @@ def against_em2(section: dict[str, Any]) -> list[str]:
 
 def cost_table(cost: dict[str, dict[str, Any]]) -> Cells:
     """Size and speed of the models."""
-    return Cells(["", *_COST.values()], [[label, *(f"{row[name]:,}" for name in _COST)] for label, row in cost.items()])
+
+    def told(value: float | str) -> str:
+        return value if isinstance(value, str) else f"{value:,}"
+
+    return Cells(["", *_COST.values()], [[label, *(told(row[name]) for name in _COST)] for label, row in cost.items()])
 
 
 def title(source: str, section: dict[str, Any]) -> str:

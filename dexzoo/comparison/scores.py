@@ -19,6 +19,7 @@ from torch import Tensor
 
 from dexzoo.data.datamodule import GraspDataModule, GraspDataset
 from dexzoo.data.schema import SPLITS
+from dexzoo.models.encoders import has_bfloat16
 from dexzoo.models.evaluator import CHUNK, GraspEvaluator, Scene
 
 GM, COIN = "gm", "coin"
@@ -86,7 +87,7 @@ class Cost:
     parameters: those trained; the frozen trunk, shared by models, has its own. megabytes: of its weights as `save`
     writes them, without the trunk. An ensemble's members count in both. milliseconds_per_view,
     milliseconds_per_1000_grasps: best of three on `threads` threads; the view is encoded by the trunk and all, the
-    grasps are scored on one view.
+    grasps are scored on one view. processor: whose they are, and whether it has instructions for bfloat16.
     """
 
     parameters: int
@@ -94,6 +95,7 @@ class Cost:
     milliseconds_per_view: float
     milliseconds_per_1000_grasps: float
     threads: int
+    processor: str
 
 
 def rows_of(data: GraspDataModule, split: str, source: str) -> NDArray[np.int64]:
@@ -190,7 +192,13 @@ def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: 
         round(1000 * view, 1),
         round(1000 * scoring, 1),
         torch.get_num_threads(),
+        _processor(),
     )
+
+
+def _processor() -> str:
+    name = torch.cpu.get_capabilities()["cpu_name"]
+    return f"{name}, {'with' if has_bfloat16(torch.device('cpu')) else 'without'} bfloat16"
 
 
 def _best_time(work: Callable[[], object]) -> float:
