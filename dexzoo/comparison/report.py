@@ -124,8 +124,8 @@ def against_em2(section: dict[str, Any]) -> list[str]:
 def cost_table(cost: dict[str, dict[str, Any]]) -> Cells:
     """Size and speed of the models."""
 
-    def told(value: float | str) -> str:
-        return value if isinstance(value, str) else f"{value:,}"
+    def told(value: object) -> str:
+        return f"{value:,}" if isinstance(value, int | float) else str(value)
 
     return Cells(["", *_COST.values()], [[label, *(told(row[name]) for name in _COST)] for label, row in cost.items()])
 
