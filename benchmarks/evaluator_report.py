@@ -4,9 +4,9 @@ from typing import Any
 
 from tables import RESULTS, percent, read, span, table
 
+from dexzoo.comparison.compare import GENERATED
 from dexzoo.comparison.report import NOTES, against_em2, cost_table, counts_table, main_table, title
 
-GENERATED = "generated"
 WITHOUT, LESS_DATA, VARIANT = "-", "@", "+"
 """In the name of a run of benchmarks/ablation.py: without an ingredient, on so many percent of the data, otherwise."""
 

@@ -58,23 +58,21 @@ def whole(found: dict[str, Any]) -> str:
                     for other, row in variants.items()
                 ],
             ),
-            *(groups(variants) if any(GROUP in other for other in variants) else ()),
+            *groups(variants),
         ]
     )  # fmt: skip
 
 
-def groups(variants: dict[str, Any]) -> tuple[str, str]:
-    """What became of the first of each scene in the thesis' groups."""
+def groups(variants: dict[str, Any]) -> list[str]:
+    """What became of the first of each scene in the thesis' groups; nothing where none was run."""
     rows = [
         (other, RULES[rule], *row["top1"][rule]["transitions"].values())
         for other, row in variants.items()
         for rule in row["top1"]
         if GROUP in other
     ]
-    went = heads(next(iter(variants.values()))["transitions"])
-    return "What became of the first of each scene in the thesis' groups:\n", table(
-        ("variant", "ranked by", *went), rows
-    )
+    head = ("variant", "ranked by", *heads(next(iter(variants.values()))["transitions"]))
+    return ["What became of the first of each scene in the thesis' groups:\n", table(head, rows)] if rows else []
 
 
 def heads(names: dict[str, Any]) -> tuple[str, ...]:
