@@ -29,8 +29,8 @@ from dexzoo.resources import resource
 
 VIEWS_PER_FILE = 64
 """Views that are encoded and cached together; a grown set keeps the files of its old views."""
-GRASPS_PER_VIEW = 8
-"""Grasps in a training batch that share a view, where encoding views is part of each step."""
+GRASPS_PER_IMAGE, GRASPS_PER_FEATURES = 8, 4
+"""Grasps in a training batch that share a view, where encoding it is part of each step and where it is not."""
 STATISTICS_VIEWS = 256
 """Training views that the image statistics are taken from, evenly spaced."""
 
@@ -71,7 +71,8 @@ class GraspDataset(Dataset[Batch]):
     def __getitem__(self, index: list[int] | Draw) -> Batch:
         rows = torch.tensor(index.rows if isinstance(index, Draw) else index)
         view = torch.tensor(index.views) if isinstance(index, Draw) else self.view[rows]
-        shown, place = view.unique(return_inverse=True)
+        unique = Tensor.unique_consecutive if isinstance(index, Draw) else Tensor.unique
+        shown, place = unique(view, return_inverse=True)
         views: Scene | Tensor
         if isinstance(self.views, ViewImages):
             views = self.views[shown]
@@ -269,7 +270,7 @@ class GraspDataModule(LightningDataModule):
             return DataLoader(dataset, sampler=batches, batch_size=None, generator=unused)
         if not torch.bincount(dataset.success.long(), minlength=2).all():
             raise ValueError(f"grasp set {self.folder}: training needs both successes and failures")
-        together = GRASPS_PER_VIEW if isinstance(dataset.views, ViewImages) else 1
+        together = GRASPS_PER_IMAGE if isinstance(dataset.views, ViewImages) else GRASPS_PER_FEATURES
         drawn = BalancedBatches(dataset, self.batch_size, together, self.seed, rank, world_size)
         return ResumableLoader(dataset, sampler=drawn, batch_size=None, generator=unused)
 

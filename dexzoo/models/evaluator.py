@@ -281,8 +281,8 @@ class GraspEvaluator(LightningModule):
         """Stochastic gradient descent as in the thesis, or AdamW."""
         weights = [parameter for parameter in self.parameters() if parameter.requires_grad]
         if self.optimizer == "sgd":
-            return torch.optim.SGD(weights, lr=self.learning_rate, weight_decay=self.weight_decay)
-        return torch.optim.AdamW(weights, lr=self.learning_rate, weight_decay=self.weight_decay)
+            return torch.optim.SGD(weights, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        return torch.optim.AdamW(weights, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep the random state, so that dropout goes on after a kill as it would have without."""
