@@ -12,7 +12,7 @@ from dexzoo.generators.demonstration import SHIPPED, load_demonstrations
 from dexzoo.generators.density import Grips
 from dexzoo.generators.kopicki import KopickiGenerator, Way
 from dexzoo.generators.search import anneal, climb
-from dexzoo.generators.surroundings import obstacles, underneath
+from dexzoo.generators.surroundings import beyond, obstacles, underneath
 from dexzoo.grasp import GRIP, Grasps
 from dexzoo.hand import Hand
 from dexzoo.sim import Scene
@@ -143,8 +143,28 @@ def test_what_carries_an_object_is_guessed_to_be_under_its_middle(name: str, gen
     assert float(guess[:, 2].max()) == pytest.approx(2 * float(half[2]), abs=0.01)
 
 
+@pytest.mark.parametrize("name", ["knife_02", "scissors_02", "spatula_01"])
+def test_the_hidden_rest_of_what_carries_an_object_is_where_it_is_guessed(name: str) -> None:
+    scene = Scene.place(make_object(name), seed=0)
+    support = scene.support
+    assert support is not None
+    view = scene.observe(seed=1)
+    camera = torch.tensor(view.T_world_camera[:3, 3], dtype=torch.float32)
+    seen = obstacles(view)
+    guess = beyond(torch.from_numpy(view.points_world), seen, camera)
+    guess = guess[torch.from_numpy(~view.would_see(guess.numpy()))]
+    pose, half = torch.tensor(support.pose, dtype=torch.float32), torch.tensor(support.half, dtype=torch.float32)
+    inside = (((guess - pose[:3, 3]) @ pose[:3, :3]).abs() < half + 0.01).all(-1)
+    assert inside.float().mean() > 0.8
+    block = (2 * torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) - 1) * half
+    gap = torch.cdist(block @ pose[:3, :3].T + pose[:3, 3], torch.cat((seen, guess))).amin(1)
+    assert (gap < 0.01).float().mean() > 0.9, "and next to nothing of it is left out"
+
+
 def test_nothing_is_guessed_under_what_stands_on_the_table(generator: KopickiGenerator, can_view: Observation) -> None:
-    assert not len(underneath(generator.density(can_view).surface.points))
+    points = generator.density(can_view).surface.points
+    assert not len(underneath(points))
+    assert not len(beyond(points, points, torch.tensor([0.0, -0.5, 0.5])))
 
 
 def test_the_cost_by_the_nearest_points_is_that_by_all(generator: KopickiGenerator) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from dexzoo.camera import Observation
@@ -14,6 +15,10 @@ SPACING = 0.007
 """Metres between the points, closer than a fingertip is thick."""
 MIN_CARRIED = 0.015
 """Metres over the table from which on an object does not stand on it by itself."""
+BESIDE = 0.015
+"""Metres from the object within which what is seen may carry it."""
+LEAST_BREADTH = 0.03
+"""Metres that what carries an object goes on under it at least."""
 
 
 def obstacles(observation: Observation) -> Tensor:
@@ -22,22 +27,32 @@ def obstacles(observation: Observation) -> Tensor:
     cloud = observation.camera.directions()[other] * observation.depth[other][:, None]
     T = observation.T_world_camera
     points = cloud @ T[:3, :3].T + T[:3, 3]
-    _, first = np.unique(np.floor(points / SPACING), axis=0, return_index=True)
-    return torch.tensor(points[first], dtype=torch.float32)
+    return _thinned(points)
 
 
-def underneath(surface: Tensor) -> Tensor:
-    """(n, 3) a guess of what carries an object that lies clear of the table: its middle half is filled down to it.
+class _Footprint:
+    """The smallest upright rectangle around points, seen from above."""
 
-    Whatever it is, a camera above hardly sees it, and the centre of mass is over it.
+    def __init__(self, points: Tensor) -> None:
+        centre, extents, angle = cv2.minAreaRect(points[:, :2].contiguous().numpy())
+        turn = np.deg2rad(angle)
+        self.centre, self.extents = points.new_tensor(centre), points.new_tensor(extents)
+        self.axes = points.new_tensor([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+
+    def holds(self, points: Tensor, centre: Tensor, half: Tensor) -> Tensor:
+        """(n,) whether points are within half extents of a centre along the rectangle's sides."""
+        return (((points[:, :2] - centre) @ self.axes.T).abs() <= half).all(-1)
+
+
+def underneath(surface: Tensor, share: float = 0.5) -> Tensor:
+    """(n, 3) a guess of what carries an object that lies clear of the table: its middle is filled down to it.
+
+    Whatever it is, a camera above hardly sees it, and the centre of mass is over it. share: of both sides' lengths.
     """
-    if surface[:, 2].quantile(0.01) < MIN_CARRIED:
+    if not _is_carried(surface):
         return surface[:0]
-    _, extents, angle = cv2.minAreaRect(surface[:, :2].contiguous().numpy())
-    turn = np.deg2rad(angle)
-    axes = surface.new_tensor([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    within = (surface[:, :2] - surface[:, :2].mean(0)) @ axes.T
-    carried = surface[(within.abs() <= surface.new_tensor(extents) / 4).all(-1)].numpy()
+    foot = _Footprint(surface)
+    carried = surface[foot.holds(surface, surface[:, :2].mean(0), share / 2 * foot.extents)].numpy()
     if not len(carried):
         return surface[:0]
     cells = np.floor(carried[:, :2] / SPACING).astype(int)
@@ -56,3 +71,32 @@ def underneath(surface: Tensor) -> Tensor:
         ]
     )
     return torch.tensor(points, dtype=torch.float32)
+
+
+def beyond(surface: Tensor, seen: Tensor, camera: Tensor) -> Tensor:
+    """(n, 3) a guess of the hidden rest of what carries an object: the part of it that is seen, carried on.
+
+    What is seen beside the object and below it goes on under the object, level, away from the camera, to the far side
+    of the object or as far as the object is broad.
+    surface: of the object. seen: of what else is on the table. camera: its place.
+    """
+    if not _is_carried(surface):
+        return surface[:0]
+    foot = _Footprint(surface)
+    half = foot.extents / 2
+    start = seen[foot.holds(seen, foot.centre, half + BESIDE) & (seen[:, 2] < surface[:, 2].median())]
+    away = torch.nn.functional.normalize(foot.centre - camera[:2], dim=0)
+    steps = SPACING * torch.arange(1, int(max(float(foot.extents.min()), LEAST_BREADTH) / SPACING) + 1)
+    swept = start.repeat(len(steps), 1)
+    swept[:, :2] += (steps[:, None] * away).repeat_interleave(len(start), 0)
+    return _thinned(swept[foot.holds(swept, foot.centre, half)].numpy())
+
+
+def _is_carried(surface: Tensor) -> bool:
+    return float(surface[:, 2].quantile(0.01)) >= MIN_CARRIED
+
+
+def _thinned(points: NDArray[np.floating]) -> Tensor:
+    """The first point in each cube."""
+    _, first = np.unique(np.floor(points / SPACING), axis=0, return_index=True)
+    return torch.tensor(points[first], dtype=torch.float32)

@@ -14,7 +14,7 @@ from torch import Tensor
 from dexzoo.camera import Observation
 from dexzoo.generators.density import GraspDensity, Grips
 from dexzoo.generators.generator import MIN_CLEARANCE
-from dexzoo.generators.surroundings import obstacles, underneath
+from dexzoo.generators.surroundings import beyond, obstacles, underneath
 from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, in_frame, pose_matrix
 from dexzoo.hand import Hand
 
@@ -27,6 +27,8 @@ AT_OBJECT = 1
 NUM_OBSERVED, NUM_SHADOW = 256, 128
 SHADOW_DEPTHS = (0.007, 0.014)
 """Metres behind the observed surface, along the line of sight, at which the object is taken to go on."""
+MIDDLE = 0.35
+"""Share of the object's sides under which it is taken to be carried, besides where what carries it is seen."""
 NUM_NEAR = 128
 """Points of a kind that are looked at around each hand: enough for what is near to stay so in the trust region."""
 
@@ -46,9 +48,10 @@ class Surroundings:
         sight = torch.nn.functional.normalize(some - camera, dim=-1)
         behind = torch.cat([some + depth * sight for depth in SHADOW_DEPTHS])
         self.shadow = behind[behind[:, 2] > 0]
-        guess = underneath(points)
+        seen = obstacles(observation)
+        guess = torch.cat((underneath(points, MIDDLE), beyond(points, seen, camera)))
         hidden = guess[torch.from_numpy(~observation.would_see(guess.numpy()))]
-        self.others = torch.cat((obstacles(observation), hidden))
+        self.others = torch.cat((seen, hidden))
 
 
 def _evenly(points: Tensor, num: int) -> Tensor:
