@@ -12,7 +12,6 @@ from torch import Tensor
 
 from dexzoo.camera import Observation
 from dexzoo.generators.density import GraspDensity
-from dexzoo.generators.surroundings import SPACING
 from dexzoo.hand import Hand
 from dexzoo.models.evaluator import PreparedView
 from dexzoo.refinement.penalties import AT_OBJECT, WAY, Posed, Prior, Surroundings
@@ -90,11 +89,11 @@ class Objective:
 
     @torch.no_grad()
     def lacks(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
-        """The term "table" on the whole way to the grip, each point standing for its cell; 0 where it has no weight."""
+        """The term "table" on the whole way to the grip; 0 where it has no weight."""
         if not self.weights.table:
             return waypoints.new_zeros(len(waypoints))
         every = self.surroundings.others[None, None]
-        return torch.cat([Posed(self.hand, part, WAY).table(every, SPACING / 2) for part in waypoints.split(_TOGETHER)])
+        return torch.cat([Posed(self.hand, part, WAY).table(every) for part in waypoints.split(_TOGETHER)])
 
     def value(self, terms: Terms) -> Float[Tensor, " grasp"]:
         """What the terms add up to."""

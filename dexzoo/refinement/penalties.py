@@ -29,6 +29,8 @@ SHADOW_DEPTHS = (0.007, 0.014)
 """Metres behind the observed surface, along the line of sight, at which the object is taken to go on."""
 MIDDLE = 0.35
 """Share of the object's sides under which it is taken to be carried, besides where what carries it is seen."""
+AROUND = 0.005
+"""Metres about each point of what stands on the table that count as it: between points, and for the camera's error."""
 NUM_NEAR = 128
 """Points of a kind that are looked at around each hand: enough for what is near to stay so in the trust region."""
 
@@ -83,15 +85,12 @@ class Posed:
         """Metres that the deepest point lies in each link, summed over links and moments."""
         return (-self.distance(near, AT_OBJECT).amin(-1)).clamp_min(0).sum((-1, -2))
 
-    def table(self, near: Float[Tensor, "#grasp #moment near 3"], around: float = 0.0) -> Float[Tensor, " grasp"]:
-        """Metres that each link lacks of its clearance from the table and what stands on it, summed likewise.
-
-        around: metres about each point that belong to what stands there.
-        """
+    def table(self, near: Float[Tensor, "#grasp #moment near 3"]) -> Float[Tensor, " grasp"]:
+        """Metres that each link lacks of its clearance from the table and what stands on it, summed likewise."""
         # the third row of a pose is the table's plane in the palm frame
         clearance = self.hand.clearance(self.links, self.wrist[..., 2, :])
         if near.shape[-2]:
-            clearance = torch.minimum(clearance, self.distance(near).amin(-1) - around)
+            clearance = torch.minimum(clearance, self.distance(near).amin(-1) - AROUND)
         return (MIN_CLEARANCE - clearance).clamp_min(0).sum((-1, -2))
 
     def self_collision(self) -> Float[Tensor, " grasp"]:
