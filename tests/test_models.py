@@ -173,6 +173,8 @@ def test_scoring_drops_nothing_and_leaves_the_mode(
     quiet = model.score(observation, grasps)
     model.train()
     torch.testing.assert_close(model.score(observation, grasps), quiet)
+    world = grasps.to_frame("world", observation.T_world_camera).waypoints
+    torch.testing.assert_close(model.probability(model.prepare(observation).logit(world)), quiet, atol=1e-5, rtol=0)
     assert model.training
     model.eval()
 

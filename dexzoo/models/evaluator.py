@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypedDict
@@ -74,13 +75,15 @@ class PreparedView:
 
     def logit(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
         """Log-odds of success of grasps in the world frame; differentiable."""
-        return self.evaluator.logit(self.scene, self._aimed(waypoints))[0]
+        with self.evaluator.without_dropout():
+            return self.evaluator.logit(self.scene, self._aimed(waypoints))[0]
 
     def logit_and_spread(
         self, waypoints: Float[Tensor, "grasp 10 28"]
     ) -> tuple[Float[Tensor, " grasp"], Float[Tensor, " grasp"]]:
         """Log-odds of grasps in the world frame and their spread among members; both differentiable."""
-        logit, spread = self.evaluator.logit_and_spread(self.scene, self._aimed(waypoints))
+        with self.evaluator.without_dropout():
+            logit, spread = self.evaluator.logit_and_spread(self.scene, self._aimed(waypoints))
         return logit[0], spread[0]
 
     def _aimed(self, waypoints: Tensor) -> Tensor:
@@ -206,7 +209,7 @@ class GraspEvaluator(LightningModule):
     def prepare(self, observation: Observation) -> PreparedView:
         """Encode an observation once. Any observation will do: it is aimed at the object first."""
         aimed = observation.aimed()
-        with torch.no_grad():
+        with torch.no_grad(), self.without_dropout():
             scene = self.encode(aimed.image()[None].to(self.device))
         T_aimed_world = torch.linalg.inv(torch.from_numpy(aimed.T_world_camera))
         return PreparedView(self, scene, T_aimed_world.to(self.device))
@@ -218,15 +221,22 @@ class GraspEvaluator(LightningModule):
         observation: any view of the object; grasps: in the world frame or in that of the observation's camera.
         Dropout is off whatever the module's mode.
         """
-        training = self.training
+        prepared = self.prepare(observation)
+        world = grasps.to_frame("world", observation.T_world_camera).waypoints.to(self.device)
+        logits = [prepared.logit(part) for part in world.split(CHUNK)] if len(world) else [world.new_zeros(0)]
+        return self.probability(torch.cat(logits))
+
+    @contextmanager
+    def without_dropout(self) -> Iterator[None]:
+        """Have the module in evaluation mode for a while."""
+        if not self.training:
+            yield
+            return
         self.eval()
         try:
-            prepared = self.prepare(observation)
-            world = grasps.to_frame("world", observation.T_world_camera).waypoints.to(self.device)
-            logits = [prepared.logit(part) for part in world.split(CHUNK)] if len(world) else [world.new_zeros(0)]
-            return self.probability(torch.cat(logits))
+            yield
         finally:
-            self.train(training)
+            self.train()
 
     # training
 

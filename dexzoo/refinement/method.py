@@ -99,7 +99,7 @@ def refine(
     second = load(judge) if isinstance(judge, str) else judge
     if not len(grasps):
         return _of_none(grasps, second is not None)
-    view = model.eval().prepare(observation)
+    view = model.prepare(observation)
     if optimiser in BY_GRADIENT:
         _check_gradient(view, world[:1])
     if weights.prior and density is None:
@@ -111,7 +111,7 @@ def refine(
     accepted &= objective.lacks(found.waypoints) < objective.lacks(world) + MAX_LACK
     opinion = None
     if second is not None:
-        other = second.eval().prepare(observation)
+        other = second.prepare(observation)
         opinion = log_odds(other, world), log_odds(other, found.waypoints)
         accepted &= opinion[1] - opinion[0] > margin
 

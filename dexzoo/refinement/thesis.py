@@ -61,7 +61,7 @@ def ascend(
     observation = as_observation(depth, camera)
     world = checked_in_world(grasps, observation)
     model = load(evaluator) if isinstance(evaluator, str) else evaluator
-    view = model.eval().prepare(observation)
+    view = model.prepare(observation)
     parts = [_ascend(view, part, GROUPS[group], step_size) for part in world.split(CHUNK)]
     after, failed = (torch.cat(values) for values in zip(*parts, strict=True))
     accepted = torch.ones_like(failed)
