@@ -10,6 +10,7 @@ threads. The simulator selects nothing.
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -30,7 +32,7 @@ from dexzoo.generators.kopicki import KopickiGenerator
 from dexzoo.grasp import GRIP
 from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator
-from dexzoo.refinement import Refinement, Region, Weights, thesis
+from dexzoo.refinement import Refinement, Region, Weights, method, thesis
 from dexzoo.sim import Scene, trial
 
 METHOD = "method"
@@ -47,6 +49,16 @@ def by_refine(evaluator: GraspEvaluator, judge: GraspEvaluator | None, **argumen
     return run
 
 
+def whatever_rises(run: Variant) -> Variant:
+    """The variant without acceptance: what the climb found is taken wherever the objective rose."""
+
+    def taken(grasps: Grasps, view: Observation, density: GraspDensity) -> Refinement:
+        with patch.object(method, "MAX_LACK", math.inf):
+            return run(grasps, view, density)
+
+    return taken
+
+
 def by_thesis(evaluator: GraspEvaluator, group: str) -> Variant:
     return lambda grasps, view, _: thesis.ascend(grasps, view, evaluator, group=group)
 
@@ -55,30 +67,31 @@ def variants(
     model: GraspEvaluator, judge: GraspEvaluator | None, others: list[str], tries: Path | None
 ) -> dict[str, Variant]:
     """All that can be run, by name, the method first."""
-    method = partial(by_refine, model, judge)
+    by = partial(by_refine, model, judge)
     known = {
-        METHOD: method(),
+        METHOD: by(),
         **{f"group {name}": by_thesis(model, name) for name in thesis.GROUPS},
-        "L-BFGS": method(optimiser="lbfgs"),
-        "Metropolis-Hastings": method(optimiser="metropolis"),
-        "random search": method(optimiser="random"),
-        "no prior": method(weights=Weights(prior=0.0)),
-        "no penetration": method(weights=Weights(penetration=0.0, shadow=0.0)),
-        "no coupling": method(variables="uncoupled"),
-        "280 free numbers": method(variables="waypoints"),
+        "L-BFGS": by(optimiser="lbfgs"),
+        "Metropolis-Hastings": by(optimiser="metropolis"),
+        "random search": by(optimiser="random"),
+        "no prior": by(weights=Weights(prior=0.0)),
+        "no penetration": by(weights=Weights(penetration=0.0, shadow=0.0)),
+        "no coupling": by(variables="uncoupled"),
+        "no acceptance": whatever_rises(by_refine(model, None)),
+        "280 free numbers": by(variables="waypoints"),
     }
     if judge is not None:
         known["no judge"] = by_refine(model, None)
     for name in others:
         other = dexzoo.load(name)
-        known[f"guided by {name}"] = by_refine(other, judge)
-        known |= {f"group {group} by {name}": by_thesis(other, group) for group in thesis.GROUPS}
+        known[f"guided by {Path(name).name}"] = by_refine(other, judge)
+        known |= {f"group {group} by {Path(name).name}": by_thesis(other, group) for group in thesis.GROUPS}
     if tries:
         for name, arguments in json.loads(tries.read_text()).items():
             for key, kind in (("region", Region), ("weights", Weights)):
                 if key in arguments:
                     arguments[key] = kind(**arguments[key])
-            known[name] = method(**arguments)
+            known[name] = by(**arguments)
     return known
 
 
