@@ -1,10 +1,15 @@
-"""The figures of the benchmark of refinement, against a count by hand."""
+"""The benchmark of refinement: what it tries, and its figures against a count by hand."""
 
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+
+from dexzoo.generators.kopicki import KopickiGenerator
+from dexzoo.grasp import Grasps
+from dexzoo.refinement import Refinement
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 
@@ -62,3 +67,31 @@ def test_outcomes_are_counted_as_in_the_thesis(figures, tmp_path: Path) -> None:
     assert top["before"]["transitions"]["fail_to_success"] == 1
     assert top["before"]["transitions"]["success_to_collided"] == 1
     assert top["after"]["transitions"]["fail_to_collided"] == 1
+
+
+@pytest.mark.slow
+def test_only_what_was_replaced_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    import refine
+
+    world, view, seed, _ = refine.set_scene("validation", None, 2)
+    generator = KopickiGenerator()
+    given = refine.give(generator, world, view, seed, num_grasps=6)
+    assert len(given) == 6
+    assert given.success.any()
+    grasps, replaced = Grasps(torch.tensor(given.waypoints), "world"), np.array([True, False] * 3)
+
+    def sunk(some: Grasps, *_: object) -> Refinement:
+        waypoints = some.waypoints.clone()
+        waypoints[replaced, :, 2] -= 0.2
+        score, flag = torch.full((len(some),), 0.5), torch.tensor(replaced)
+        return Refinement(Grasps(waypoints, "world"), score, score, flag, ~flag & False, {})
+
+    row = refine.attempt(sunk, grasps, given, world, view, generator.density(view, seed))
+    assert (row.outcome[~replaced] == given.outcome[~replaced]).all()
+    assert (row.penetration[~replaced] == given.penetration[~replaced]).all()
+    assert row.collided[replaced].all()
+    assert not row.success[replaced].any()
+    assert np.isnan(row.judge_after).all()
+    for name in ("refine", "generator", "refine_figures", "generator_figures"):
+        sys.modules.pop(name, None)
