@@ -32,12 +32,13 @@ from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.resources import resource
 
 NUM_VALIDATIONS = 20
+REFINED = "refined"
 Replicates = NDArray[np.float64]
 FIGURES = ("accuracy", "auroc", "scene_auroc", "average_precision", "calibration_error", "top1", "top5")
 
 
 class Run(NamedTuple):
-    """config: its file. changes: what differs from it. against: the run that its figures are compared with."""
+    """config: its file. changes: what differs from it, by PART.NAME. against: the run that it is compared with."""
 
     config: str
     changes: dict[str, Any]
@@ -45,20 +46,24 @@ class Run(NamedTuple):
 
 
 def runs() -> dict[str, Run]:
-    """All runs by name: whole models, then NAME-WHAT without an ingredient, NAME@PERCENT on less data, NAME+VARIANT."""
-    whole = {"em_fk": ("em_fk.yaml", {}), "em2": ("em2-adamw.yaml", {}), "em1": ("em1-adamw.yaml", {})}
-    known = {name: Run(*made) for name, made in whole.items()}
+    """All runs by name: whole models, then NAME-WHAT without an ingredient, NAME@PERCENT on less data, NAME+VARIANT.
+
+    But for em_fk+refined they go without refined grasps, which were made with the help of all training scenes.
+    """
+    base = {"data.sources": [source for source in SOURCES if source != REFINED]}
+    whole = {"em_fk": "em_fk.yaml", "em2": "em2-adamw.yaml", "em1": "em1-adamw.yaml"}
+    known = {name: Run(config, base) for name, config in whole.items()}
     for part in ("image", "depth", "cloud", "table", "attention"):
-        known[f"em_fk-{part}"] = Run("em_fk.yaml", {f"model.{part}": False}, "em_fk")
-    for part in ("perturbed", "refined"):
-        rest = [source for source in SOURCES if source != part]
-        known[f"em_fk-{part}"] = Run("em_fk.yaml", {"data.sources": rest}, "em_fk")
+        known[f"em_fk-{part}"] = Run("em_fk.yaml", base | {f"model.{part}": False}, "em_fk")
+    known["em_fk-perturbed"] = Run("em_fk.yaml", {"data.sources": SOURCES[:1]}, "em_fk")
     for share in (10, 30):
-        for name, (config, changes) in whole.items():
-            known[f"{name}@{share}"] = Run(config, changes | {"data.train_share": share / 100}, name)
-    known["em2+4096"] = Run("em2-adamw.yaml", {"model.width": 4096}, "em2")
-    known["em1+thesis"] = Run("em1.yaml", {}, "em1")
-    known["em2+thesis"] = Run("em2.yaml", {}, "em2")
+        for name, config in whole.items():
+            known[f"{name}@{share}"] = Run(config, base | {"data.train_share": share / 100}, name)
+    known["em_fk+refined"] = Run("em_fk.yaml", {"data.sources": SOURCES}, "em_fk")
+    known["em_fk+seed"] = Run("em_fk.yaml", base | {"seed_everything": 1, "data.seed": 1}, "em_fk")
+    known["em2+4096"] = Run("em2-adamw.yaml", base | {"model.width": 4096}, "em2")
+    known["em1+thesis"] = Run("em1.yaml", base, "em1")
+    known["em2+thesis"] = Run("em2.yaml", base, "em2")
     return known
 
 
@@ -118,8 +123,9 @@ def configuration(run: Run, data: str, grasps: int) -> dict[str, Any]:
     """The shipped configuration with the run's changes, its length counted in grasps, not stopped early."""
     config: dict[str, Any] = yaml.safe_load((resource("configs") / run.config).read_text())
     for key, value in run.changes.items():
-        part, name = key.split(".")
-        (config["model"]["init_args"] if part == "model" else config[part])[name] = value
+        part, _, name = key.rpartition(".")
+        place = {"": config, "data": config["data"], "model": config["model"]["init_args"]}[part]
+        place[name] = value
     config["data"]["folder"] = data
     steps = max(1, grasps // config["data"]["batch_size"])
     interval = max(1, steps // NUM_VALIDATIONS)
@@ -141,7 +147,7 @@ def measured(folder: Path, known: dict[str, Run], address: str) -> dict[str, Any
     rows: dict[str, Any] = {}
     for name in [name for name in known if finished(folder / name)]:
         model = dexzoo.load(folder / name)
-        rows[name] = described(folder / name, model, data)
+        rows[name] = described(folder / name, known[name], model, data)
         replicates[name] = {source: replicated(model, data, truth, source) for source, truth in labels.items()}
         rows[name]["figures"] = {source: with_intervals(found) for source, found in replicates[name].items()}
     for name, row in rows.items():
@@ -156,16 +162,19 @@ def measured(folder: Path, known: dict[str, Run], address: str) -> dict[str, Any
     return {"data": data.source.sha256, "test": sizes, "runs": rows}
 
 
-def described(folder: Path, model: GraspEvaluator, data: GraspDataModule) -> dict[str, Any]:
-    """What a run was and what its model takes."""
+def described(folder: Path, run: Run, model: GraspEvaluator, data: GraspDataModule) -> dict[str, Any]:
+    """What a run was and what its model takes. ValueError where it was made of other data or in another way."""
     card = json.loads(next(folder.glob("*.json")).read_text())
     if card["data"]["sha256"] != data.source.sha256:
         raise ValueError(f"{folder} was trained on another grasp set than {data.folder}; run it anew")
     config = yaml.safe_load(asked(folder).read_text())
+    grasps_seen = config["trainer"]["max_steps"] * config["data"]["batch_size"]
+    if config != configuration(run, config["data"]["folder"], grasps_seen):
+        raise ValueError(f"{asked(folder)} differs from what is asked for now; run it anew in another --folder")
     dataset = data.dataset("test", model, [SOURCES[0]])
     image, grasps = first_image(data, "test"), dataset.aimed(torch.arange(len(dataset)))
     return {
-        "grasps_seen": config["trainer"]["max_steps"] * config["data"]["batch_size"],
+        "grasps_seen": grasps_seen,
         "train_grasps": card["data"]["train_grasps"],
         "validation_auroc": card["metrics"]["validation_auroc"],
         "cost": asdict(measure(model, image, grasps)),

@@ -1,11 +1,13 @@
 """What benchmarks/report.py writes of the evaluators, from the JSON of several benchmarks."""
 
+import json
 from typing import Any
 
 from tables import RESULTS, percent, read, span, table
 
 from dexzoo.comparison.compare import GENERATED
 from dexzoo.comparison.report import NOTES, against_em2, cost_table, counts_table, main_table, title
+from dexzoo.resources import resource
 
 WITHOUT, LESS_DATA, VARIANT = "-", "@", "+"
 """In the name of a run of benchmarks/ablation.py: without an ingredient, on so many percent of the data, otherwise."""
@@ -25,7 +27,7 @@ def evaluators() -> str:
 
 def comparison(found: dict[str, Any]) -> str:
     """The comparison's own tables, and its charts."""
-    parts = ["## Evaluators\n", f"`benchmarks/comparison.py`. {NOTES}"]
+    parts = ["## Evaluators\n", f"`benchmarks/comparison.py`. {NOTES}", *of_other_data(found)]
     for source, section in found["sources"].items():
         parts += [f"{title(source, section)}:\n", table(*main_table(section))]
         parts += [table(*counts_table(section)), *against_em2(section)] if source == GENERATED else []
@@ -36,6 +38,17 @@ def comparison(found: dict[str, Any]) -> str:
         "![Success of the first grasp by category](comparison/categories.png)\n",
     ]
     return "\n".join(parts)
+
+
+def of_other_data(found: dict[str, Any]) -> list[str]:
+    """What has to be known of models that have learnt from another grasp set than the one compared on."""
+    told = []
+    for name in found["weights"]:
+        path = resource("checkpoints") / f"{name}.json"
+        data = json.loads(path.read_text())["data"] if path.exists() else {}
+        if data and data.get("sha256") != found["data"]["sha256"]:
+            told.append(f"`{name}` has learnt from {data['train_grasps']:,} grasps of another, earlier set.\n")
+    return told
 
 
 def repeated(found: dict[str, Any]) -> str:
@@ -65,14 +78,15 @@ def meshes(found: dict[str, Any]) -> str:
     """The comparison on objects that are no part of dexzoo, and what became of each object's grasps."""
     section, objects = found["sources"][GENERATED], found["objects"]
     rows = section["rows"]
-    scenes, tried = (sum(one[key] for one in objects.values()) for key in ("with_one_that_holds", "scenes"))
+    scenes, tried = (sum(one[key] for one in objects.values()) for key in ("with_one_that_holds", "with_grasps"))
     without = "; ".join(f"{name} ({', '.join(why)})" for name, why in found["objects_without_grasps"].items())
     return "\n".join(
         [
             "### On objects from elsewhere\n\n`benchmarks/meshes.py`; scanned and CAD household objects that are no "
             "part of dexzoo, 0.2 kg, friction 0.7, the default generator's grasps on one view of each scene. At least "
-            f"one grasp holds in {scenes} of {tried} scenes, which bounds every top-1. There is no validation split to "
-            "choose a threshold for gm on; scenes of one object are alike, so that intervals are too narrow. "
+            f"one grasp holds in {scenes} of {tried} scenes with grasps, which bounds every top-1. There is no "
+            "validation split to choose a threshold for gm on; scenes of one object are alike, so that intervals are "
+            "too narrow. "
             f"Objects without any grasp: {without or 'none'}.\n\n"
             f"{title(GENERATED, section)}:\n",
             table(*main_table(section)),
@@ -99,19 +113,20 @@ def first(of_object: dict[str, Any] | None) -> str:
 
 
 def ablation(found: dict[str, Any]) -> str:
-    """Ingredients, the learning curve, and the variants of EM2."""
+    """Ingredients, the learning curve, and variants."""
     runs = found["runs"]
     texts = {
         WITHOUT: "What each ingredient brings; a minus stands for without:",
         LESS_DATA: "With 10, 30 and 100 % of the training scenes:",
-        VARIANT: "Width and recipe of EM2:",
+        VARIANT: "With refined grasps besides; with another seed, which tells what chance brings; with the width of "
+        "the thesis' table; and by the thesis' recipe, cut to as many grasps as the others see:",
     }
     sizes = ", ".join(f"{size['grasps']:,} {source}" for source, size in found["test"].items())
     seen = " or ".join(f"{count:,}" for count in sorted({row["grasps_seen"] for row in runs.values()}))
     parts = [
         f"### Ingredients, data, width and recipe\n\n`benchmarks/ablation.py`; each run sees {seen} grasps in "
         f"training, the weights are the best on validation; test objects, {sizes} grasps. Changes are from the run "
-        "that stands first of its kind, with their intervals over the same draws of scenes.\n"
+        "that stands first of its kind, with their intervals over the same draws of scenes; one seed each.\n"
     ]
     for mark, text in texts.items():
         changed = sorted(name for name in runs if mark in name)

@@ -3,9 +3,9 @@
 python benchmarks/refine.py --evaluator RUN --judge OTHER_RUN --out benchmarks/results/refinement.json
 The objects of a split come round in turn, each scene with its own drawn mass and friction, in which a grasp is tried as
 given and as refined. `--folder` keeps what was done in each scene, so that a run can be continued: take a new one when
-the program has changed. Hyper-parameters are chosen with `--split validation --tries FILE`: JSON of names, and for each
-the arguments of `dexzoo.refine` that differ. Intervals are 95 % bootstrap over scenes; OMP_NUM_THREADS bounds the
-threads. The simulator selects nothing.
+the program, the meshes or what a try's name means has changed. Hyper-parameters are chosen with `--split validation`
+and `--tries FILE`: JSON of names, and for each the arguments of `dexzoo.refine` that differ. Intervals are 95 %
+bootstrap over scenes; OMP_NUM_THREADS bounds the threads. The simulator selects nothing.
 """
 
 import argparse
@@ -33,6 +33,7 @@ from dexzoo.grasp import GRIP
 from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.refinement import Refinement, Region, Weights, method, thesis
+from dexzoo.refinement.penalties import AROUND, MIDDLE
 from dexzoo.sim import Scene, trial
 
 METHOD = "method"
@@ -84,10 +85,13 @@ def variants(
         known["no judge"] = by_refine(model, None)
     for name in others:
         other = dexzoo.load(name)
-        known[f"guided by {Path(name).name}"] = by_refine(other, judge)
-        known |= {f"group {group} by {Path(name).name}": by_thesis(other, group) for group in thesis.GROUPS}
+        label = f"{other.architecture} {other.digest[:8]}"
+        known[f"guided by {label}"] = by_refine(other, judge)
+        known |= {f"group {group} by {label}": by_thesis(other, group) for group in thesis.GROUPS}
     if tries:
         for name, arguments in json.loads(tries.read_text()).items():
+            if name in known:
+                raise ValueError(f"{tries}: the name {name!r} is taken; use another")
             for key, kind in (("region", Region), ("weights", Weights)):
                 if key in arguments:
                     arguments[key] = kind(**arguments[key])
@@ -143,6 +147,7 @@ def main() -> None:
         "judge": options.judge,
         "digest": {"evaluator": model.digest, "judge": judge.digest if judge else None},
         "defaults": {"region": asdict(Region()), "weights": asdict(Weights())},
+        "clearance": {"around": AROUND, "middle": MIDDLE, "max_lack": method.MAX_LACK},
         "split": source,
         "num_grasps": options.num_grasps,
         "without_grasp": sum(not len(row) for row in given.values()),

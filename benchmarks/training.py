@@ -20,8 +20,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import dexzoo
-from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.data.datamodule import Draw, GraspDataModule
 from dexzoo.models.em2 import EM2
+from dexzoo.models.encoders import has_bfloat16
 from dexzoo.models.evaluator import CHUNK, Batch
 
 KEPT_STEPS, TRUNK_STEPS = 16, 2
@@ -60,15 +61,15 @@ def training(data: GraspDataModule) -> dict[str, Any]:
     batches = list(data.loader(features, balanced=True).sampler)
 
     def step(batch: Batch) -> None:
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16(torch.device("cpu"))):
             loss = F.binary_cross_entropy_with_logits(model.batch_logit(batch), batch.success)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
 
-    def with_trunk(rows: list[int]) -> None:
-        batch = images[rows]
-        step(batch._replace(views=model.encode(batch.views[batch.view]), view=torch.arange(len(rows))))
+    def with_trunk(draw: Draw) -> None:
+        batch = images[draw]
+        step(batch._replace(views=model.encode(batch.views[batch.view]), view=torch.arange(len(draw.rows))))
 
     kept = seconds(lambda rows: step(features[rows]), batches[:KEPT_STEPS]) / (KEPT_STEPS * data.batch_size)
     trunk = seconds(with_trunk, batches[:TRUNK_STEPS]) / (TRUNK_STEPS * data.batch_size)

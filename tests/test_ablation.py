@@ -41,12 +41,19 @@ def test_every_run_names_arguments_that_there_are(ablation: Any) -> None:  # noq
         assert (resource("configs") / run.config).is_file()
         assert (made == shipped) == (not run.changes), name
         for key in run.changes:
-            part, argument = key.split(".")
+            part, _, argument = key.rpartition(".")
             if part == "model":
                 assert argument in shipped["model"]["init_args"], name
         whole, _, without = name.partition("-")
         if without:  # one ingredient less, and nothing else
-            assert [*run.changes.values()] in ([False], [[source for source in SOURCES if source != without]]), name
+            base = ablation.runs()[whole].changes
+            sources = run.changes["data.sources"]
+            less = (
+                {"perturbed": sources}
+                if without == "perturbed"
+                else {key: run.changes[key] for key in run.changes.keys() - base}
+            )
+            assert [*less.values()] in ([False], [SOURCES[:1]]), name
             assert run.against == whole
         assert made["trainer"]["max_steps"] * made["data"]["batch_size"] == 64_000
         assert run.against is None or run.against in ablation.runs()

@@ -13,6 +13,7 @@ import torch
 import torchvision
 import yaml
 from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.plugins.precision import MixedPrecision
 from safetensors.torch import load_file
 
 from dexzoo import training
@@ -172,10 +173,13 @@ def test_scoring_drops_nothing_and_leaves_the_mode(
 ) -> None:
     quiet = model.score(observation, grasps)
     model.train()
+    *_, still = model.modules()
+    still.eval()
     torch.testing.assert_close(model.score(observation, grasps), quiet)
     world = grasps.to_frame("world", observation.T_world_camera).waypoints
     torch.testing.assert_close(model.probability(model.prepare(observation).logit(world)), quiet, atol=1e-5, rtol=0)
     assert model.training
+    assert not still.training
     model.eval()
 
 
@@ -267,6 +271,16 @@ def test_inputs_are_standardised_and_constant_ones_survive(data: GraspDataModule
     torch.testing.assert_close(vector.mean(0), torch.zeros(280), atol=1e-4, rtol=0)
     torch.testing.assert_close(vector[:, varied].std(0), torch.ones(int(varied.sum())), atol=1e-3, rtol=0)
     assert (vector[:, 10].abs() < 1e-5).all()
+
+
+def test_gradients_can_be_clipped_where_precision_is_mixed() -> None:
+    model = EM2(width=8, optimizer="adamw")
+    model.trainer = Trainer(gradient_clip_val=1.0, logger=False, enable_checkpointing=False)
+    for parameter in model.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    MixedPrecision("bf16-mixed", "cpu").clip_gradients(model.configure_optimizers(), 1.0)
+    size = torch.stack([parameter.grad.square().sum() for parameter in model.parameters()]).sum().sqrt()
+    assert float(size) == pytest.approx(1.0, rel=1e-3)
 
 
 def test_xavier(data: GraspDataModule) -> None:

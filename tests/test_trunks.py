@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import synthetic
 import torch
+from lightning.pytorch import LightningModule
 from safetensors.torch import save_file
 
 from dexzoo.data.grasp_set import GraspSet
@@ -116,8 +117,27 @@ def test_a_trunk_is_trained_on_views(tmp_path: Path, monkeypatch: pytest.MonkeyP
     train_resnet50 = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(train_resnet50)
     folder = synthetic.write(tmp_path / "grasps", num_grasps=4)
-    places = ["--folder", str(tmp_path / "run"), "--out", str(tmp_path)]
-    train_resnet50.main(["--data", str(folder), *places, "--epochs", "2", "--batch_size", "4"])
+    asked = ["--data", str(folder), "--epochs", "2", "--batch_size", "4"]
+    step = train_resnet50.Pretext.training_step
+
+    def killed(self: LightningModule, rows: torch.Tensor, batch_idx: int) -> torch.Tensor:
+        if self.current_epoch == 1:
+            raise RuntimeError("killed")
+        return step(self, rows, batch_idx)
+
+    for name, kill in (("unbroken", False), ("broken", True)):
+        places = ["--folder", str(tmp_path / name), "--out", str(tmp_path)]
+        if kill:
+            with monkeypatch.context() as patch:
+                patch.setattr(train_resnet50.Pretext, "training_step", killed)
+                with pytest.raises(RuntimeError, match="killed"):
+                    train_resnet50.main([*asked, *places])
+        train_resnet50.main([*asked, *places])
+        (tmp_path / "resnet50_views.safetensors").rename(tmp_path / f"{name}.safetensors")
+    assert (tmp_path / "broken.safetensors").read_bytes() == (tmp_path / "unbroken.safetensors").read_bytes()
+    with pytest.raises(ValueError, match="holds a run on other data or with other options; give another --folder"):
+        train_resnet50.main([*asked, *places, "--seed", "1"])
+    train_resnet50.main([*asked, *places])  # there is nothing left to do but to write the files
     card = json.loads((tmp_path / "resnet50_views.json").read_text())
     assert set(card["in_the_last_epoch"]) == {"right", "normals"}
     monkeypatch.setattr(trunks, "resource", lambda name: tmp_path)

@@ -16,6 +16,7 @@ import json
 import shlex
 import sys
 from pathlib import Path
+from typing import Any
 
 import lightning
 import numpy as np
@@ -44,6 +45,8 @@ class Pretext(lightning.LightningModule):
     def __init__(self, data: GraspSet, split: str, epochs: int, batch_size: int, seed: int) -> None:
         super().__init__()
         self.epochs, self.batch_size, self.seed = epochs, batch_size, seed
+        self.asked = f"{data.sha256} {split} {epochs} {batch_size} {seed}"
+        self.told: dict[str, float] = {}
         names = data.scenes["category"].to_pylist()
         kinds = sorted(set(names))
         views = np.flatnonzero(np.array(data.scenes["split"].to_pylist())[data.view_scene] == split)
@@ -90,9 +93,19 @@ class Pretext(lightning.LightningModule):
 
     def on_train_epoch_end(self) -> None:
         """Say how far it is."""
-        told = self.trainer.callback_metrics
-        line = f"{100 * told['right']:.1f} % of categories right, normals {told['normals']:.3f} off"
+        self.told = {name: round(float(self.trainer.callback_metrics[name]), 4) for name in ("right", "normals")}
+        line = f"{100 * self.told['right']:.1f} % of categories right, normals {self.told['normals']:.3f} off"
         sys.stderr.write(f"epoch {self.current_epoch}: {line}\n")
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep what was asked for and what the last epoch told."""
+        checkpoint |= {"asked": self.asked, "told": self.told}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """ValueError where something else was asked for."""
+        if checkpoint["asked"] != self.asked:
+            raise ValueError("the folder holds a run on other data or with other options; give another --folder")
+        self.told = checkpoint["told"]
 
 
 def main(args: list[str]) -> None:
@@ -125,7 +138,7 @@ def main(args: list[str]) -> None:
     card = {
         "trunk": "ResNet-50, trained here on rendered views by the objects' categories and the surfaces' normals",
         "data": {"version": VERSION, "sha256": data.sha256},
-        "in_the_last_epoch": {name: round(float(trainer.callback_metrics[name]), 4) for name in ("right", "normals")},
+        "in_the_last_epoch": task.told,
         "seed": options.seed,
         "precision": "int8, a scale for each output channel",
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),

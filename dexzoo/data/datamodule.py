@@ -71,6 +71,7 @@ class GraspDataset(Dataset[Batch]):
     def __getitem__(self, index: list[int] | Draw) -> Batch:
         rows = torch.tensor(index.rows if isinstance(index, Draw) else index)
         view = torch.tensor(index.views) if isinstance(index, Draw) else self.view[rows]
+        # a view drawn twice stays twice: with as many grasps for each, all of them are looked at in one go
         unique = Tensor.unique_consecutive if isinstance(index, Draw) else Tensor.unique
         shown, place = unique(view, return_inverse=True)
         views: Scene | Tensor

@@ -40,7 +40,7 @@ class Batch(NamedTuple):
     """Grasps with the view each is paired with.
 
     views: the views that occur, encoded, or, where the encoder is trained, as images (view, 2, 224, 224); each of them
-    is paired with a grasp.
+    is paired with a grasp, and some may occur more than once.
     view: (batch,) which of them each grasp is paired with.
     grasps: (batch, 1, 10, 28) waypoints in the frame of the view's aimed camera.
     success: (batch,) 0 or 1. scene_index: (batch,) which scene of the set.
@@ -228,15 +228,14 @@ class GraspEvaluator(LightningModule):
 
     @contextmanager
     def without_dropout(self) -> Iterator[None]:
-        """Have the module in evaluation mode for a while."""
-        if not self.training:
-            yield
-            return
+        """Have the module in evaluation mode for a while, and then each part of it in its own mode again."""
+        training = [part for part in self.modules() if part.training]
         self.eval()
         try:
             yield
         finally:
-            self.train()
+            for part in training:
+                part.training = True
 
     # training
 
@@ -288,11 +287,14 @@ class GraspEvaluator(LightningModule):
         return self.probability(self.batch_logit(batch))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Stochastic gradient descent as in the thesis, or AdamW."""
+        """Stochastic gradient descent as in the thesis, or AdamW; in one kernel unless gradients are clipped.
+
+        Lightning refuses to clip for a fused optimiser where precision is mixed.
+        """
         weights = [parameter for parameter in self.parameters() if parameter.requires_grad]
-        if self.optimizer == "sgd":
-            return torch.optim.SGD(weights, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
-        return torch.optim.AdamW(weights, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        fused = self._trainer is None or not self._trainer.gradient_clip_val
+        kind = torch.optim.SGD if self.optimizer == "sgd" else torch.optim.AdamW
+        return kind(weights, lr=self.learning_rate, weight_decay=self.weight_decay, fused=fused)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep the random state, so that dropout goes on after a kill as it would have without."""
