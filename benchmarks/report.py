@@ -31,6 +31,7 @@ def summary() -> str:
     generated = read("comparison")["sources"]["generated"]
     best, gm = (generated["rows"][name]["figures"] for name in ("em_fk", "gm"))
     method = read("refinement")["variants"]["method"]
+    meshes = read("refinement_meshes")["variants"]["method"]
     first = method["top1"]["before"]
 
     def of_hundred(figure: dict[str, Any]) -> str:
@@ -57,6 +58,11 @@ def summary() -> str:
             "grasps that would hit the table or a block, as generated and refined",
             f"{method['collided_before']} and {method['collided_after']}",
         ),
+        (
+            f"on {meshes['objects']} scanned and CAD objects from elsewhere, success of {meshes['grasps']} grasps",
+            rate(meshes["success_before"]),
+        ),
+        ("the same, refined", rate(meshes["success_after"])),
     ]
     return table(("what, on test objects", "figure (95 % interval over scenes)"), rows)
 
