@@ -29,7 +29,7 @@ SHADOW_DEPTHS = (0.007, 0.014)
 """Metres behind the observed surface, along the line of sight, at which the object is taken to go on."""
 MIDDLE = 0.35
 """Share of the object's sides under which it is taken to be carried, besides where what carries it is seen."""
-AROUND = 0.005
+AROUND = 0.007
 """Metres about each point of what stands on the table that count as it: between points, and for the camera's error."""
 NUM_NEAR = 128
 """Points of a kind that are looked at around each hand: enough for what is near to stay so in the trust region."""
