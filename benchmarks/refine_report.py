@@ -30,6 +30,8 @@ def whole(found: dict[str, Any]) -> str:
     name, first = next(iter(variants.items()))
     judge = "accepted where the objective rises and the way keeps its clearance"
     judge += f", if `{found['judge']}` agrees" if found["judge"] else ""
+    several = first["scenes"] > first["objects"]
+    alike = "; several are of one object, so that for objects they are somewhat too narrow" if several else ""
     went = heads(first["transitions"])
     rules = first["top1"]
     return "\n".join(
@@ -37,13 +39,7 @@ def whole(found: dict[str, Any]) -> str:
             f"`benchmarks/refine.py`; {first['scenes']} scenes of {first['objects']} objects ({found['split']}), at "
             f"most {found['num_grasps']} grasps of the Kopicki generator each, {first['grasps']:,} in all; in "
             f"{found['without_grasp']} more scenes it found none. Guided by `{found['evaluator']}`, {judge}. The same "
-            "trials before and after; the simulator selects nothing. Intervals are over scenes"
-            + (
-                "; several are of one object, so that for objects they are somewhat too narrow"
-                if first["scenes"] > first["objects"]
-                else ""
-            )
-            + ".\n",
+            f"trials before and after; the simulator selects nothing. Intervals are over scenes{alike}.\n",
             outcomes(variants),
             "Where the grasps went (thesis, Tables 4.2 and 4.3):\n",
             table(("variant", *went), [(other, *row["transitions"].values()) for other, row in variants.items()]),

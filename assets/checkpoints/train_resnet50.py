@@ -40,16 +40,16 @@ SMALL = 128
 
 
 class Pretext(lightning.LightningModule):
-    """The trunk and what it is trained by: views, each with its category."""
+    """The trunk and what it is trained by: views of training objects, each with its category."""
 
-    def __init__(self, data: GraspSet, split: str, epochs: int, batch_size: int, seed: int) -> None:
+    def __init__(self, data: GraspSet, epochs: int, batch_size: int, seed: int) -> None:
         super().__init__()
         self.epochs, self.batch_size, self.seed = epochs, batch_size, seed
-        self.asked = f"{data.sha256} {split} {epochs} {batch_size} {seed}"
+        self.asked = f"{data.sha256} {epochs} {batch_size} {seed}"
         self.told: dict[str, float] = {}
         names = data.scenes["category"].to_pylist()
         kinds = sorted(set(names))
-        views = np.flatnonzero(np.array(data.scenes["split"].to_pylist())[data.view_scene] == split)
+        views = np.flatnonzero(np.array(data.scenes["split"].to_pylist())[data.view_scene] == "train")
         self.images = data.images(views.tolist())
         self.kind = torch.tensor([kinds.index(name) for name in names])[data.view_scene[views]]
         self.encoder = DepthEncoder(NAME)
@@ -120,7 +120,7 @@ def main(args: list[str]) -> None:
     options = parser.parse_args(args)
     lightning.seed_everything(options.seed, verbose=False)
     data = GraspSet(options.data)
-    task = Pretext(data, "train", options.epochs, options.batch_size, options.seed)
+    task = Pretext(data, options.epochs, options.batch_size, options.seed)
     trainer = lightning.Trainer(
         max_epochs=options.epochs,
         precision="bf16-mixed" if has_bfloat16(task.device) else "32-true",

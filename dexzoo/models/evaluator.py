@@ -230,7 +230,8 @@ class GraspEvaluator(LightningModule):
     def without_dropout(self) -> Iterator[None]:
         """Have the module in evaluation mode for a while, and then each part of it in its own mode again."""
         training = [part for part in self.modules() if part.training]
-        self.eval()
+        for part in training:
+            part.training = False
         try:
             yield
         finally:
