@@ -150,40 +150,63 @@ class SegmentPairs:
     def distance(self, poses: Tensor, half: Tensor, radius: Tensor, num_pairs: int) -> Tensor:
         """(batch, pair) smallest distances, negative by how deep the deepest point of a segment lies in the box.
 
-        poses: (batch, shape, 4, 4); half: (shape, 3); radius: (shape,). The distance of a point that runs along a
-        segment to a convex body is convex, so its slope is halved down to the minimum. From inside, the deepest point
-        is as near to one face as to another: the ends of what is left of the segment lie on either side, and the
-        gradient is that of both, in the shares with which their slopes along the segment cancel.
+        poses: (batch, shape, 4, 4); half: (shape, 3); radius: (shape,).
         """
         first, second = poses[:, self.first], poses[:, self.second]
-        turn = second[..., :3, :3]
-        offset = first[..., :3, 3] - second[..., :3, 3]
-
-        def seen(point: Tensor) -> Tensor:
-            relative = (first[..., :3, :3] @ point.to(poses)[..., None]).squeeze(-1) + offset
-            return (relative[..., None, :] @ turn).squeeze(-2).movedim(-1, 0)
-
-        start, end = seen(self.start), seen(self.end)
-        box = half[self.second].T[:, None]
-
-        with torch.no_grad():
-            along = end - start
-
-            def rise(t: Tensor) -> Tensor:
-                return _rise(start + t * along, along, box)
-
-            low, high = torch.zeros_like(start[0]), torch.ones_like(start[0])
-            for _ in range(_HALVINGS[poses.dtype]):
-                t = (low + high) / 2
-                rises = rise(t) > 0
-                low, high = torch.where(rises, low, t), torch.where(rises, t, high)
-            fall, climb = -rise(low), rise(high)
-            share = (fall / (fall + climb).clamp_min(torch.finfo(fall.dtype).tiny)).clamp(0, 1)
         gap = radius[self.first] + radius[self.second]
-        before, after = (box_distance(torch.lerp(start, end, t), box, gap) for t in (low, high))
-        found = torch.lerp(before, after, share)
+        found = _segment_distance(first, second, self.start, self.end, half[self.second].T[:, None], gap)
         far = found.new_full((len(found), num_pairs), torch.inf)
         return far.scatter_reduce(-1, self.pair.to(found.device).expand_as(found), found, "amin")
+
+    def overlap(self, poses: Tensor, half: Tensor, radius: Tensor, num_pairs: int) -> Tensor:
+        """(batch, pair) what `distance` is below zero, 0 where it is not; only what can meet is looked at."""
+        indices = self.first, self.second, self.pair
+        first, second, pair = (torch.as_tensor(index, device=poses.device) for index in indices)
+        centre, reach = poses.detach()[..., :3, 3], half.norm(dim=-1) + radius
+        apart = (centre[:, first] - centre[:, second]).norm(dim=-1)
+        row, segment = (apart < reach[first] + reach[second]).nonzero(as_tuple=True)
+        first, second = first[segment], second[segment]
+        start, end = self.start.to(poses)[segment], self.end.to(poses)[segment]
+        gap = radius[first] + radius[second]
+        found = _segment_distance(poses[row, first], poses[row, second], start, end, half[second].T, gap)
+        none = found.new_zeros(len(poses) * num_pairs)
+        deepest = none.scatter_reduce(0, row * num_pairs + pair[segment], (-found).clamp_min(0), "amax")
+        return deepest.view(len(poses), num_pairs)
+
+
+def _segment_distance(first: Tensor, second: Tensor, start: Tensor, end: Tensor, half: Tensor, gap: Tensor) -> Tensor:
+    """(...) distances of segments to boxes, less `gap`; negative by how deep their deepest points lie.
+
+    first, second: (..., 4, 4) poses of segments and boxes; start, end: (..., 3) in the segments' frames; half: (3, ...).
+    The distance of a point that runs along a segment to a convex body is convex, so its slope is halved down to the
+    minimum. From inside, the deepest point is as near to one face as to another: the ends of what is left of the
+    segment lie on either side, and the gradient is that of both, in the shares with which their slopes along the
+    segment cancel.
+    """
+    turn = second[..., :3, :3]
+    offset = first[..., :3, 3] - second[..., :3, 3]
+
+    def seen(point: Tensor) -> Tensor:
+        relative = (first[..., :3, :3] @ point.to(first)[..., None]).squeeze(-1) + offset
+        return (relative[..., None, :] @ turn).squeeze(-2).movedim(-1, 0)
+
+    start, end = seen(start), seen(end)
+
+    with torch.no_grad():
+        along = end - start
+
+        def rise(t: Tensor) -> Tensor:
+            return _rise(start + t * along, along, half)
+
+        low, high = torch.zeros_like(start[0]), torch.ones_like(start[0])
+        for _ in range(_HALVINGS[first.dtype]):
+            t = (low + high) / 2
+            rises = rise(t) > 0
+            low, high = torch.where(rises, low, t), torch.where(rises, t, high)
+        fall, climb = -rise(low), rise(high)
+        share = (fall / (fall + climb).clamp_min(torch.finfo(fall.dtype).tiny)).clamp(0, 1)
+    before, after = (box_distance(torch.lerp(start, end, t), half, gap) for t in (low, high))
+    return torch.lerp(before, after, share)
 
 
 def _rise(point: Tensor, along: Tensor, half: Tensor) -> Tensor:

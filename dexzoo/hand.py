@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dexzoo.geometry import PointDistance, SegmentPairs
+from dexzoo.geometry import PointDistance, SegmentPairs, box_distance
 from dexzoo.hand_spec import HandSpec, Inertia, Joint, Pad, Primitive, Side
 from dexzoo.kinematics import KinematicTree, LinkPoses
 
@@ -90,6 +90,7 @@ class Hand(nn.Module):
         self._shape_link = [self.link_names.index(shape.link) for shape in shapes]
         ends = np.cumsum([sum(shape.link == name for shape in shapes) for name in self.solid_names]).tolist()
         self._shape_groups = [slice(*bounds) for bounds in itertools.pairwise([0, *ends])]
+        self._shape_solid = [self.solid_names.index(shape.link) for shape in shapes]
         self._shape_pose = torch.tensor(np.stack([shape.pose for shape in shapes]))
         self._shape_half = torch.tensor(np.stack([shape.half for shape in shapes]))
         self._shape_radius = torch.tensor([shape.radius for shape in shapes], dtype=torch.float64)
@@ -248,6 +249,27 @@ class Hand(nn.Module):
         distance: Tensor = PointDistance.apply(transform, points, half, radius, self._shape_groups)
         return distance.reshape(*batch, *distance.shape[-2:])
 
+    def closest_distance(
+        self, links: Float[Tensor, "*batch link 4 4"], points: Float[Tensor, "*cloud point 3"]
+    ) -> Float[Tensor, "*both solid"]:
+        """Distance in metres from each solid link to the closest of the points, negative inside; inf without points.
+
+        The least of `signed_distance` over the points, several times faster where a gradient is wanted: it is taken of
+        the closest points alone.
+        """
+        if not points.shape[-2]:
+            batch = torch.broadcast_shapes(links.shape[:-3], points.shape[:-2])
+            return links.new_full((*batch, len(self.solid_names)), torch.inf)
+        with torch.no_grad():
+            closest = self.signed_distance(links, points).argmin(-1)
+        cloud = points.expand(*closest.shape[:-1], *points.shape[-2:])
+        point = cloud.take_along_dim(closest[..., None], -2)[..., self._shape_solid, :]
+        constants, poses = self._cast(links), self.shape_poses(links)
+        local = ((point - poses[..., :3, 3])[..., None, :] @ poses[..., :3, :3]).squeeze(-2).movedim(-1, 0)
+        half = constants.shape_half.T.view(3, *(1,) * (local.ndim - 2), -1)
+        distance = box_distance(local, half, constants.shape_radius)
+        return torch.stack([distance[..., group].amin(-1) for group in self._shape_groups], dim=-1)
+
     def self_distance(self, links: Float[Tensor, "*batch link 4 4"]) -> Float[Tensor, "*batch pair"]:
         """Distance in metres between the links of each of `self_pairs`, negative where they overlap.
 
@@ -258,6 +280,16 @@ class Hand(nn.Module):
         poses = self.shape_poses(links).reshape(-1, len(self.shapes), 4, 4)
         distance = self._pairs.distance(poses, constants.shape_half, constants.shape_radius, len(self.self_pairs))
         return distance.reshape(*links.shape[:-3], len(self.self_pairs))
+
+    def self_overlap(self, links: Float[Tensor, "*batch link 4 4"]) -> Float[Tensor, "*batch pair"]:
+        """Metres that the links of each of `self_pairs` overlap, 0 where they do not: what `self_distance` is below 0.
+
+        Several times faster, since most pairs are too far apart to be looked at.
+        """
+        constants = self._cast(links)
+        poses = self.shape_poses(links).reshape(-1, len(self.shapes), 4, 4)
+        overlap = self._pairs.overlap(poses, constants.shape_half, constants.shape_radius, len(self.self_pairs))
+        return overlap.reshape(*links.shape[:-3], len(self.self_pairs))
 
     def clearance(
         self, links: Float[Tensor, "*batch link 4 4"], plane: Float[Tensor, "*plane 4"]

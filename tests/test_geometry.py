@@ -226,6 +226,18 @@ def test_self_distance_takes_any_batch_and_precision(hand: Hand, batch: tuple[in
     torch.testing.assert_close(single.double(), distance, atol=2e-6, rtol=0)
 
 
+def test_overlap_is_what_the_distance_is_below_zero(hand: Hand) -> None:
+    draw = torch.rand(300, len(hand.joint_names), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    q = (hand.lower + draw * (hand.upper - hand.lower)).requires_grad_()
+    overlap = hand.self_overlap(hand.forward_kinematics(q))
+    expected = (-hand.self_distance(hand.forward_kinematics(q))).clamp_min(0)
+    assert (expected > 0.002).any(-1).sum() > 20
+    torch.testing.assert_close(overlap, expected)
+    (theirs,) = torch.autograd.grad(expected.sum(), q)
+    torch.testing.assert_close(torch.autograd.grad(overlap.sum(), q)[0], theirs)
+    assert hand.self_overlap(hand.forward_kinematics(q[:0])).shape == (0, len(hand.self_pairs))
+
+
 def test_which_links_can_meet(hand: Hand) -> None:
     pairs = {frozenset(pair) for pair in hand.self_pairs}
     assert len(pairs) == len(hand.self_pairs) == 16 * 15 / 2 - 5 - 10  # palm-proximal, and neighbours along a finger

@@ -319,6 +319,19 @@ def test_distances_broadcast(hand: Hand) -> None:
     torch.testing.assert_close(hand.clearance(links, planes)[1], hand.clearance(links[1], planes[1]))
 
 
+def test_the_closest_point_of_each_link(hand: Hand) -> None:
+    q20 = postures(hand, 4).requires_grad_()
+    points = torch.rand(2, 1, 9, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64) * 0.2
+    points.requires_grad_()
+    ours = hand.closest_distance(hand.forward_kinematics(q20), points)
+    every = hand.signed_distance(hand.forward_kinematics(q20), points).amin(-1)
+    assert ours.shape == (2, 4, len(hand.solid_names))
+    torch.testing.assert_close(ours, every)
+    theirs = torch.autograd.grad(every.sin().sum(), (q20, points))
+    torch.testing.assert_close(torch.autograd.grad(ours.sin().sum(), (q20, points)), theirs)
+    assert (hand.closest_distance(hand.forward_kinematics(q20), points[..., :0, :]) == torch.inf).all()
+
+
 def test_distances_have_gradients(hand: Hand) -> None:
     q20 = postures(hand, 1)[0].requires_grad_()
     generator = torch.Generator().manual_seed(5)

@@ -70,32 +70,31 @@ class Posed:
         self.wrist = pose_matrix(way[..., POSITION], way[..., QUATERNION])
         self.links = hand.forward_kinematics(way[..., JOINTS])
 
-    def distance(self, points: Tensor, first: int = 0) -> Float[Tensor, "grasp moment solid point"]:
-        """Metres from points of the world (*cloud, n, 3) to each link, negative inside, from one moment on."""
-        wrist = self.wrist[:, first:]
-        return self.hand.signed_distance(self.links[:, first:], in_frame(wrist, points))
-
     @torch.no_grad()
     def nearest(self, points: Float[Tensor, "point 3"], first: int = 0) -> Float[Tensor, "grasp moment near 3"]:
         """The points nearest to any link at each moment, from one on."""
         num = min(NUM_NEAR, len(points))
-        return points[self.distance(points, first).amin(-2).topk(num, largest=False, sorted=False).indices]
+        distance = self.hand.signed_distance(self.links[:, first:], in_frame(self.wrist[:, first:], points)).amin(-2)
+        return points[distance.topk(num, largest=False, sorted=False).indices]
+
+    def closest(self, points: Tensor, first: int = 0) -> Float[Tensor, "grasp moment solid"]:
+        """Metres from each link to the closest of points of the world (*cloud, n, 3), negative inside."""
+        return self.hand.closest_distance(self.links[:, first:], in_frame(self.wrist[:, first:], points))
 
     def penetration(self, near: Float[Tensor, "grasp moment near 3"]) -> Float[Tensor, " grasp"]:
         """Metres that the deepest point lies in each link, summed over links and moments."""
-        return (-self.distance(near, AT_OBJECT).amin(-1)).clamp_min(0).sum((-1, -2))
+        return (-self.closest(near, AT_OBJECT)).clamp_min(0).sum((-1, -2))
 
     def table(self, near: Float[Tensor, "#grasp #moment near 3"]) -> Float[Tensor, " grasp"]:
         """Metres that each link lacks of its clearance from the table and what stands on it, summed likewise."""
         # the third row of a pose is the table's plane in the palm frame
         clearance = self.hand.clearance(self.links, self.wrist[..., 2, :])
-        if near.shape[-2]:
-            clearance = torch.minimum(clearance, self.distance(near).amin(-1) - AROUND)
+        clearance = torch.minimum(clearance, self.closest(near) - AROUND)
         return (MIN_CLEARANCE - clearance).clamp_min(0).sum((-1, -2))
 
     def self_collision(self) -> Float[Tensor, " grasp"]:
         """Metres that links overlap at the grip, summed over pairs."""
-        return (-self.hand.self_distance(self.links[:, -1])).clamp_min(0).sum(-1)
+        return self.hand.self_overlap(self.links[:, -1]).sum(-1)
 
 
 class Prior:
