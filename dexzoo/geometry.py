@@ -177,11 +177,11 @@ class SegmentPairs:
 def _segment_distance(first: Tensor, second: Tensor, start: Tensor, end: Tensor, half: Tensor, gap: Tensor) -> Tensor:
     """(...) distances of segments to boxes, less `gap`; negative by how deep their deepest points lie.
 
-    first, second: (..., 4, 4) poses of segments and boxes; start, end: (..., 3) in the segments' frames; half: (3, ...).
-    The distance of a point that runs along a segment to a convex body is convex, so its slope is halved down to the
-    minimum. From inside, the deepest point is as near to one face as to another: the ends of what is left of the
-    segment lie on either side, and the gradient is that of both, in the shares with which their slopes along the
-    segment cancel.
+    first, second: (..., 4, 4) poses of segments and boxes; start, end: (..., 3) in the segments' frames;
+    half: (3, ...) of the boxes. The distance of a point that runs along a segment to a convex body is convex, so its
+    slope is halved down to the minimum. From inside, the deepest point is as near to one face as to another: the ends
+    of what is left of the segment lie on either side, and the gradient is that of both, in the shares with which their
+    slopes along the segment cancel.
     """
     turn = second[..., :3, :3]
     offset = first[..., :3, 3] - second[..., :3, 3]
