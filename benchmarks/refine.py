@@ -9,6 +9,7 @@ bootstrap over scenes; OMP_NUM_THREADS bounds the threads. The simulator selects
 """
 
 import argparse
+import inspect
 import json
 import math
 import sys
@@ -65,7 +66,7 @@ def by_thesis(evaluator: GraspEvaluator, group: str) -> Variant:
 
 
 def variants(
-    model: GraspEvaluator, judge: GraspEvaluator | None, others: list[str], tries: Path | None
+    model: GraspEvaluator, judge: GraspEvaluator | None, others: dict[str, GraspEvaluator], tries: Path | None
 ) -> dict[str, Variant]:
     """All that can be run, by name, the method first."""
     by = partial(by_refine, model, judge)
@@ -77,16 +78,16 @@ def variants(
         "random search": by(optimiser="random"),
         "no prior": by(weights=Weights(prior=0.0)),
         "no penetration": by(weights=Weights(penetration=0.0, shadow=0.0)),
+        "no table": by(weights=Weights(table=0.0)),
+        "no self-collision": by(weights=Weights(self_collision=0.0)),
         "no coupling": by(variables="uncoupled"),
         "no acceptance": whatever_rises(by_refine(model, None)),
         "280 free numbers": by(variables="waypoints"),
     }
     if judge is not None:
         known["no judge"] = by_refine(model, None)
-    for name in others:
-        other = dexzoo.load(name)
-        label = f"{other.architecture} {other.digest[:8]}"
-        known[f"guided by {label}"] = by_refine(other, judge)
+    for label, other in others.items():
+        known[label] = by_refine(other, judge)
         known |= {f"group {group} by {label}": by_thesis(other, group) for group in thesis.GROUPS}
     if tries:
         for name, arguments in json.loads(tries.read_text()).items():
@@ -103,7 +104,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--evaluator", default="em_fk", help="what guides: name, file or folder")
     parser.add_argument("--judge", help="what accepts, the same")
-    parser.add_argument("--others", nargs="*", default=[], help="evaluators that guide in its place")
+    parser.add_argument(
+        "--others", nargs="*", default=[], metavar="NAME=MODEL", help="evaluators that guide in its place, as variants"
+    )
     parser.add_argument("--tries", type=Path, help="JSON of further variants")
     parser.add_argument("--variants", nargs="+", metavar="NAME", help="default: all")
     parser.add_argument("--split", default="test", choices=SPLITS)
@@ -118,7 +121,10 @@ def main() -> None:
     options = parser.parse_args()
     model = dexzoo.load(options.evaluator)
     judge = dexzoo.load(options.judge) if options.judge else None
-    known = variants(model, judge, options.others, options.tries)
+    if unnamed := [other for other in options.others if "=" not in other]:
+        parser.error(f"--others takes NAME=MODEL, got {', '.join(unnamed)}")
+    others = dict(other.split("=", 1) for other in options.others)
+    known = variants(model, judge, {name: dexzoo.load(other) for name, other in others.items()}, options.tries)
     names = options.variants or list(known)
     if unknown := set(names) - set(known):
         parser.error(f"variants {', '.join(sorted(unknown))} are unknown; use some of {', '.join(known)}")
@@ -146,7 +152,8 @@ def main() -> None:
         "evaluator": options.evaluator,
         "judge": options.judge,
         "digest": {"evaluator": model.digest, "judge": judge.digest if judge else None},
-        "defaults": {"region": asdict(Region()), "weights": asdict(Weights())},
+        "others": others,
+        "defaults": {"region": asdict(Region()), "weights": asdict(Weights())} | _defaults("num_steps", "step_size"),
         "clearance": {"around": AROUND, "middle": MIDDLE, "max_lack": method.MAX_LACK},
         "split": source,
         "num_grasps": options.num_grasps,
@@ -240,6 +247,11 @@ def depth(view: Observation, grasps: Grasps) -> np.ndarray:
         links = grasps.wrist_pose[row, : GRIP + 1, None] @ hand.forward_kinematics(grasps.joints[row, : GRIP + 1])
         deepest.append(float(-hand.signed_distance(links, points).amin().clamp_max(0)))
     return np.array(deepest)
+
+
+def _defaults(*names: str) -> dict[str, Any]:
+    parameters = inspect.signature(dexzoo.refine).parameters
+    return {name: parameters[name].default for name in names}
 
 
 def _numbers(values: torch.Tensor | None, count: int) -> np.ndarray:

@@ -85,8 +85,8 @@ def heads(names: dict[str, Any]) -> tuple[str, ...]:
 def outcomes(variants: dict[str, Any]) -> str:
     head = (
         "variant", "grasps", "hold before", "hold after", "change", "against the first", "gains for a loss", "replaced",
-        "hit the table before", "after", "penetration before, mm", "after", "mean score before", "after",
-        "processor seconds for 100",
+        "hit the table before", "after", "penetration before, mm", "after", "change", "mean score before", "after",
+        "score rises for", "no number for", "processor seconds for 100",
     )  # fmt: skip
     rows = [
         (
@@ -101,12 +101,20 @@ def outcomes(variants: dict[str, Any]) -> str:
             row["collided_before"],
             row["collided_after"],
             *(f"{1000 * row[key]:.2f}" for key in ("penetration_before", "penetration_after")),
+            millimetres(row["penetration_change"]),
             *(f"{row[key]:.3f}" for key in ("score_before", "score_after")),
+            share(row["score_higher"]),
+            row["failed"],
             f"{row['processor_seconds']['per_100_grasps']:.1f}",
         )
         for name, row in variants.items()
     ]
     return table(head, rows)
+
+
+def millimetres(change: dict[str, Any]) -> str:
+    """A change of metres with its interval."""
+    return "{:+.2f} ({:+.2f} to {:+.2f})".format(*(1000 * x for x in (change["rate"], *change["interval"])))
 
 
 def cost(found: dict[str, Any]) -> str:
