@@ -1,8 +1,9 @@
 """What refinement costs: time and memory against the number of grasps, and the time of each term.
 
 python benchmarks/refine_cost.py --evaluator RUN --out benchmarks/results/refinement_cost.json
-One view of a test object; its grasps over and over where more are wanted. The density behind the prior is made once
-for a view and stands apart. OMP_NUM_THREADS bounds the threads; run it with nothing else at work.
+One view of a fork on a block, so that every term has something to look at; its grasps over and over where more are
+wanted. The density behind the prior is made once for a view and stands apart. OMP_NUM_THREADS bounds the threads; run
+it with nothing else at work.
 """
 
 import argparse
@@ -25,6 +26,7 @@ import dexzoo
 from dexzoo.generators.kopicki import KopickiGenerator
 from dexzoo.refinement import Weights
 
+SCENE = 3
 NUM_STEPS, FEW_STEPS = 20, 2
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 """Numbers of grasps, refined in few steps."""
@@ -38,7 +40,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    _, view, seed, _ = set_scene("test", None, 0)
+    _, view, seed, _ = set_scene("test", None, SCENE)
     generator = KopickiGenerator()
     grasps = generator.generate(view, 100, seed)
     model = dexzoo.load(options.evaluator)
