@@ -19,9 +19,16 @@ from dexzoo.data.collect import ALL
 from dexzoo.data.schema import SPLITS
 from dexzoo.generators import list_generators
 from dexzoo.refinement import OPTIMISERS, RANKINGS
+from dexzoo.refinement.method import NUM_STEPS
 
 GENERATOR = "kopicki, heuristic, or a folder of demonstrations that Kopicki's learns from"
 TRAINING = ("fit", "validate", "test", "predict")
+IDLE: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    "plan": ("refine", (), ("judge", "ranking")),
+    "refine": ("judge", (), ("margin",)),
+    "collect": ("refine", ("scenes", "ray", "split", "generator", "num_views", "trials", "images"), ("round",)),
+}
+"""Of a command: the option that decides, the options that are of no use with it, and those that are of none without."""
 OK, FAILED, WRONG_CALL = 0, 1, 2
 
 _out = Console()
@@ -35,8 +42,10 @@ def main(args: Sequence[str] | None = None) -> int:
         if args and args[0] in TRAINING:
             training.main(args)
             return OK
-        config = _parser().parse_args(args or ["--help"])
+        parser, commands = _parser()
+        config = parser.parse_args(args or ["--help"])
         options: Namespace = config[config.subcommand]
+        _check_use(config.subcommand, options, commands[config.subcommand].get_defaults())
         result, table = COMMANDS[config.subcommand](options)
         if options.json:
             sys.stdout.write(json.dumps(result, indent=2) + "\n")
@@ -66,13 +75,26 @@ def _check_command(args: Sequence[str]) -> None:
         raise ValueError(f"command {args[0]!r} is unknown{hint} use one of {', '.join(known)}")
 
 
+def _check_use(command: str, options: Namespace, defaults: Namespace) -> None:
+    """ValueError for an option that would do nothing."""
+    if command not in IDLE:
+        return
+    decides, idle_with, idle_without = IDLE[command]
+    given = options[decides] != defaults[decides]
+    use, hint = ("with", "leave it out") if given else ("without", "add that, or leave it out")
+    for name in idle_with if given else idle_without:
+        if options[name] != defaults[name]:
+            raise ValueError(f"--{name} does nothing {use} --{decides}; {hint}")
+
+
 def _complain(error: Exception | str, status: int) -> int:
     message = " ".join(str(error).split())
     sys.stderr.write(f"dexzoo: {message}\n")
     return status
 
 
-def _parser() -> ArgumentParser:
+def _parser() -> tuple[ArgumentParser, dict[str, ArgumentParser]]:
+    """The parser, and that of each command."""
     # errors are raised, not printed with a page of usage
     parser = ArgumentParser(
         prog="python -m dexzoo",
@@ -81,12 +103,14 @@ def _parser() -> ArgumentParser:
         f"Training: {', '.join(TRAINING)} (each with --config FILE and --help of its own).",
     )
     commands = parser.add_subcommands(dest="subcommand", required=True)
+    made: dict[str, ArgumentParser] = {}
 
     def add(name: str, text: str) -> ArgumentParser:
         command = ArgumentParser(description=text, exit_on_error=False)
         command.add_argument("--seed", type=NonNegativeInt, default=0, help="the same seed gives the same result")
         command.add_argument("--json", action="store_true", help="print JSON for machines")
         commands.add_subcommand(name, command, help=text)
+        made[name] = command
         return command
 
     def add_observation(command: ArgumentParser) -> None:
@@ -111,7 +135,7 @@ def _parser() -> ArgumentParser:
     command.add_argument("--judge", help="model that a refined grasp must please too; as --evaluator")
     command.add_argument("--margin", type=float, default=0.0, help="log-odds by which the judge must find it better")
     command.add_argument("--optimiser", default="adam", choices=list(OPTIMISERS), help="how the objective is climbed")
-    command.add_argument("--num_steps", type=NonNegativeInt, default=30, help="evaluations of each grasp")
+    command.add_argument("--num_steps", type=NonNegativeInt, default=NUM_STEPS, help="evaluations of each grasp")
     command.add_argument("--out", type=Path, help="file for the refined grasps (.safetensors)")
     command.add_argument("--picture", type=Path, help="file for the best grasp before and after (.png)")
 
@@ -162,4 +186,4 @@ def _parser() -> ArgumentParser:
     command.add_argument("--port", type=NonNegativeInt, default=8080, help="of this machine; 0 takes any free one")
 
     add("models", "List the evaluative models.")
-    return parser
+    return parser, made

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jsonargparse import Namespace
 from rich.console import Console
 from rich.progress import Progress, track
 from rich.table import Table
+from torch import Tensor
 
 from dexzoo import plots
 from dexzoo.camera import Observation
@@ -21,7 +24,7 @@ from dexzoo.comparison.report import terminal_table, write
 from dexzoo.data.collect import Configuration, collect
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.grasp_set import GraspSet
-from dexzoo.data.refined import Refining, collect_refined, slices
+from dexzoo.data.refined import Refining, collect_refined, slices, training_scenes
 from dexzoo.data.writer import MANIFEST, read_manifest
 from dexzoo.generators.demonstration import SHIPPED, Demonstration
 from dexzoo.generators.preshape import close, read_preshapes, read_recording
@@ -62,9 +65,8 @@ def _plan(options: Namespace) -> Result:
     for name in ("rank", "type", "generator's rank", "score", "refined"):
         table.add_column(name, justify="left" if name == "type" else "right")
     for row in rows[:10]:
-        table.add_row(
-            str(row["rank"]), row["type"], str(row["generator_rank"]), f"{row['score']:.3f}", f"{row['refined']:.3f}"
-        )
+        scores = ("none" if row[name] is None else f"{row[name]:.3f}" for name in ("score", "refined"))
+        table.add_row(str(row["rank"]), row["type"], str(row["generator_rank"]), *scores)
     return {"grasps": rows}, table
 
 
@@ -79,8 +81,8 @@ def _plan_rows(result: Plan) -> list[dict[str, Any]]:
     parts = zip(
         result.grasps.grasp_type.tolist(),
         result.generator_rank.tolist(),
-        result.score.tolist(),
-        result.refined_score.tolist(),
+        _scores(result.score),
+        _scores(result.refined_score),
         palms,
         strict=True,
     )
@@ -89,12 +91,23 @@ def _plan_rows(result: Plan) -> list[dict[str, Any]]:
             "rank": rank,
             "type": GRASP_TYPES[kind],
             "generator_rank": place + 1,
-            "score": round(score, 4),
-            "refined": round(refined, 4),
+            "score": score,
+            "refined": refined,
             "palm": [round(x, 4) for x in palm],
         }
         for rank, (kind, place, score, refined, palm) in enumerate(parts, 1)
     ]
+
+
+def _scores(values: Tensor) -> list[float | None]:
+    """Rounded; None for what is no number, which JSON does not know."""
+    return [round(value, 4) if math.isfinite(value) else None for value in values.tolist()]
+
+
+def _mean(values: Tensor) -> float | None:
+    """Of the numbers among the values; None where there are none."""
+    known = values[torch.isfinite(values)]
+    return float(known.mean()) if len(known) else None
 
 
 def _refine(options: Namespace) -> Result:
@@ -126,10 +139,16 @@ def _refine(options: Namespace) -> Result:
         "num_grasps": len(grasps),
         "accepted": int(result.accepted.sum()),
         "failed": int(result.failed.sum()),
-        "mean_score_before": float(result.score_before.mean()) if len(grasps) else None,
-        "mean_score_after": float(result.score_after.mean()) if len(grasps) else None,
+        "mean_score_before": _mean(result.score_before),
+        "mean_score_after": _mean(result.score_after),
     }
-    return summary, _pairs("refinement", summary)
+    each = {
+        "accepted": result.accepted.nonzero().flatten().tolist(),
+        "failed": result.failed.nonzero().flatten().tolist(),
+        "score_before": _scores(result.score_before),
+        "score_after": _scores(result.score_after),
+    }
+    return summary | each, _pairs("refinement", summary)
 
 
 def _before_and_after(observation: Observation, given: Grasps, refined: Grasps) -> plots.Image:
@@ -142,7 +161,7 @@ def _verify(options: Namespace) -> Result:
     observation = scene.observe(options.seed)
     if options.grasps is not None:
         grasps = Grasps.load(options.grasps)
-        scores = [None] * len(grasps)
+        scores: list[float | None] = [None] * len(grasps)
         if grasps.frame != "world":
             raise ValueError(
                 f"{options.grasps} holds grasps in the camera frame; save them with to_frame('world', ...)"
@@ -150,7 +169,7 @@ def _verify(options: Namespace) -> Result:
     else:
         with _err.status("generating and scoring grasps"):
             result = plan(observation, options.evaluator, options.num_grasps, 0, options.seed, options.generator)
-        grasps, scores = result.grasps, result.score.tolist()
+        grasps, scores = result.grasps, _scores(result.score)
     with _err.status("executing grasps in simulation"):
         outcomes = verify(grasps, scene, options.seed, options.trials)
     held = np.flatnonzero(outcomes.success)
@@ -207,7 +226,7 @@ def _collect(options: Namespace) -> Result:
 
 def _collect_refined(options: Namespace) -> Result:
     how = Refining(options.refine, options.round, options.seed, options.num_grasps)
-    lines, total = collect_refined(options.out, how, options.workers), len(slices(options.out))
+    lines, total = collect_refined(options.out, how, options.workers), len(slices(training_scenes(options.out)))
     for _ in track(lines, "refining and trying", total, console=_err, disable=not _err.is_terminal):
         pass
     grasps = GraspSet(options.out)

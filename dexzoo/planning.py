@@ -10,11 +10,13 @@ from torch import Tensor
 from dexzoo.camera import Observation
 from dexzoo.generators import make_generator
 from dexzoo.generators.generator import GraspGenerator
+from dexzoo.generators.kopicki import KopickiGenerator
 from dexzoo.grasp import Grasps
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
-from dexzoo.refinement import rank, refine
-from dexzoo.refinement.ranking import check
+from dexzoo.refinement import Weights, rank, refine
+from dexzoo.refinement.method import check_judge
+from dexzoo.refinement.ranking import best_first, check
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ def plan(
 ) -> Plan:
     """Generate grasps, rank them by the evaluator and refine the best `num_refined`, which stay ahead of the others.
 
+    generator: as in `generate`; Kopicki's is the prior of refinement too, with others there is none.
     judge: a second evaluator, without whose consent no grasp is replaced. ranking: the order of the refined, a name in
     `dexzoo.refinement.RANKINGS`; "before" leaves that of the scores as generated: ranking by refined scores picks the
     grasps whose score inflated most (thesis, Table 4.6).
@@ -65,12 +68,21 @@ def plan(
     model = load(evaluator) if isinstance(evaluator, str) else evaluator
     second = load(judge) if isinstance(judge, str) else judge
     check(ranking, second is not None)
-    generated = generate(observation, num_grasps, seed, generator)
+    if second is not None:
+        check_judge(model, second)
+    chosen = make_generator(generator) if isinstance(generator, str) else generator
+    density, weights = None, Weights(prior=0.0)
+    if isinstance(chosen, KopickiGenerator):
+        density, weights = chosen.density(observation, seed), Weights()
+        generated = chosen.generate(observation, num_grasps, seed, density)
+    else:
+        generated = chosen.generate(observation, num_grasps, seed)
     score = model.score(observation, generated)
-    order = score.argsort(descending=True, stable=True)
+    order = best_first(score)
     if num_refined <= 0:
         return Plan(generated[order], generated[order], score[order], score[order], order)
-    result = refine(generated[order[:num_refined]], observation, model, judge=second)
+    best = generated[order[:num_refined]]
+    result = refine(best, observation, model, judge=second, weights=weights, density=density)
     place, rest = rank(result, ranking), order[num_refined:]
     order = torch.cat((order[:num_refined][place], rest))
     grasps = Grasps.concatenate([result.grasps[place], generated[rest]])

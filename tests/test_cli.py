@@ -5,6 +5,7 @@ import runpy
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import synthetic
 import torch
 import trimesh
 from safetensors.torch import save_file
+from torch import Tensor
 
 from dexzoo import cli, commands, planning
 from dexzoo.camera import Observation
@@ -21,6 +23,7 @@ from dexzoo.data import collect as collecting
 from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import GRASP_TYPES, Grasps
 from dexzoo.models.em2 import EM2
+from dexzoo.models.evaluator import Scene
 from dexzoo.models.zoo import list_models
 
 Run = Callable[..., tuple[int, str, str]]
@@ -138,9 +141,10 @@ def test_refine_improves_a_file_of_grasps(run: Run, observed: list[object], some
     assert (status, err) == (0, "")
     result = json.loads(out)
     assert result["num_grasps"] == 6
-    assert 0 <= result["accepted"] <= 6
-    assert result["failed"] == 0
-    assert 0 < result["mean_score_before"] < 1
+    assert set(result["accepted"]) <= set(range(6))
+    assert result["failed"] == []
+    assert len(result["score_before"]) == len(result["score_after"]) == 6
+    assert result["mean_score_before"] == pytest.approx(np.mean(result["score_before"]), abs=1e-4)
     assert len(Grasps.load(tmp_path / "new" / "better")) == 6
 
 
@@ -149,14 +153,42 @@ def test_refine_asks_a_judge_and_draws_what_it_did(
 ) -> None:
     args = ["--grasps", some_grasps / "world.safetensors", "--optimiser", "random", "--num_steps", 4, "--seed", 3]
     picture = tmp_path / "new" / "before and after.png"
-    judge = ["--judge", observed[-1], "--margin", 100]
+    judge = ["--judge", EM2(width=16).save(tmp_path / "judge"), "--margin", 100]
     status, out, err = run("refine", *observed, *args, *judge, "--picture", picture, "--json")
     assert (status, err) == (0, "")
-    assert json.loads(out)["accepted"] == 0  # no rise is that great
+    assert json.loads(out)["accepted"] == []  # no rise is that great
     assert cv2.imread(str(picture)).shape[1] > 2 * 460
     first, again = (run("refine", *observed, *args, "--json") for _ in range(2))
     assert first == again
-    assert json.loads(first[1])["accepted"] > 0
+    assert json.loads(first[1])["accepted"]
+    refused(
+        run("refine", *observed, *args, "--judge", observed[-1]), "the judge is, or shares a member with, what guides"
+    )
+
+
+def test_scores_that_are_none_are_null_in_json(
+    run: Run, observed: list[object], some_grasps: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def valid(text: str) -> Any:  # noqa: ANN401
+        return json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+
+    everywhere, whole = False, EM2.logit
+
+    def broken(model: EM2, scene: Scene, grasps: Tensor) -> Tensor:
+        logit = whole(model, scene, grasps)
+        return logit + torch.nan if everywhere else logit + torch.where(logit == logit[:, :1], torch.nan, 0.0)
+
+    monkeypatch.setattr(EM2, "logit", broken)
+    args = ["--grasps", some_grasps / "camera.safetensors", "--num_steps", 0, "--json"]
+    result = valid(run("refine", *observed, *args)[1])
+    assert result["score_before"][0] is None
+    assert result["mean_score_before"] == pytest.approx(np.mean(result["score_before"][1:]), abs=1e-4)
+    everywhere = True
+    assert valid(run("refine", *observed, *args)[1])["mean_score_after"] is None
+    assert valid(run("plan", *observed, "--num_grasps", 3, "--json")[1])["grasps"][0]["score"] is None
+    assert "none" in run("plan", *observed, "--num_grasps", 3)[1]
+    args = ["--object", "can_02", "--num_grasps", 2, "--evaluator", weights, "--json"]
+    assert valid(run("verify", *args)[1])["grasps"][0]["score"] is None
 
 
 def test_verify_generates_and_tries(run: Run, weights: Path) -> None:
@@ -270,6 +302,18 @@ def refused(result: tuple[int, str, str], message: str) -> None:
         (["verify", "--object", "can_02", "--mass", "-1"], "object can_02 has a mass of -1.0 kg; give a positive one"),
         (["verify", "--object", "can_02", "--friction", "3"], "has a friction of 3.0; give one in (0, 2]"),
         (["collect"], "required: --out"),
+        (
+            ["collect", "--out", "o", "--refine", "em_fk", "--images"],
+            "--images does nothing with --refine; leave it out",
+        ),
+        (["collect", "--out", "o", "--refine", "em_fk", "--scenes", "3"], "--scenes does nothing with --refine"),
+        (["collect", "--out", "o", "--round", "2"], "--round does nothing without --refine; add that, or leave it out"),
+        (["plan", "--depth", "d", "--camera", "c", "--judge", "em2"], "--judge does nothing without --refine"),
+        (["plan", "--depth", "d", "--camera", "c", "--ranking", "after"], "--ranking does nothing without --refine"),
+        (
+            ["refine", "--depth", "d", "--camera", "c", "--grasps", "g", "--margin", "1"],
+            "--margin does nothing without --judge",
+        ),
         (["fit"], "fit needs a configuration that says what the model is; add --config em2.yaml"),
         (["fit", "--config", "em9.yaml"], "configuration em9.yaml does not exist"),
     ],

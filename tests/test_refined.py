@@ -1,5 +1,6 @@
 """Refined grasps in a grasp set: only of training objects, tried, the same again, and going on where it stopped."""
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from dexzoo.generators.kopicki import KopickiGenerator
 from dexzoo.grasp import GRIP, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.models.em_fk import EMFK
-from dexzoo.refinement import Region
+from dexzoo.refinement import Region, Weights
 from dexzoo.sim import Outcomes, Scene, trial
 
 NUM = 8
@@ -159,3 +160,33 @@ def test_sets_that_cannot_be_refined_are_refused_in_one_line(tmp_path: Path, eva
         list(collect_refined(recorded, Refining(evaluator)))
     with pytest.raises(ValueError, match="model 'em22' is unknown"):
         list(collect_refined(recorded, Refining("em22")))
+
+
+def test_a_round_of_other_settings_or_of_a_set_that_grew_is_not_continued(
+    folder: Path, evaluator: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    how = Refining(evaluator, num_grasps=1)
+    list(collect_refined(folder, how))
+    manifest = folder / "manifest.json"
+    made = json.loads(manifest.read_text())["configuration"]["refined1"]
+    assert made["num_scenes"] == 2
+    assert made["region"]["wrist"] == Region().wrist
+    assert made["weights"]["table"] == Weights().table
+    assert made["num_steps"] == 30
+    assert made["clearance"] == {"table": 0.002, "around": 0.007, "lack": 0.001}
+    for name, value, told in (
+        ("NUM_STEPS", 20, "'num_steps': 30"),
+        ("AROUND", 0.005, "'clearance': {"),
+        ("training_scenes", lambda folder: [0, 1, SLICE_SCENES], "'num_scenes': 2"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(refined, name, value)
+            message = rf"refined1 of grasp set .* was made with {{{told}.*; start another --round"
+            with pytest.raises(ValueError, match=message):
+                next(iter(collect_refined(folder, how)))
+    old = json.loads(manifest.read_text())
+    old["configuration"]["refined1"] = {name: made[name] for name in ("evaluator", "seed", "num_grasps")}
+    manifest.write_text(json.dumps(old))
+    assert (GraspSet(folder).source == "refined").any()
+    with pytest.raises(ValueError, match="start another --round"):
+        next(iter(collect_refined(folder, how)))

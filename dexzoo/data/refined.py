@@ -7,7 +7,7 @@ of the grasps that it liked best is what it has to learn next.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,13 @@ from dexzoo.data.schema import SCHEMAS, decode_path, encode_path
 from dexzoo.data.workers import in_processes
 from dexzoo.data.writer import GraspSetWriter, grasp_rows
 from dexzoo.generators import default_generator
+from dexzoo.generators.generator import MIN_CLEARANCE
 from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
-from dexzoo.refinement import refine
+from dexzoo.refinement import Region, Weights, refine
+from dexzoo.refinement.method import MAX_LACK, NUM_STEPS
+from dexzoo.refinement.penalties import AROUND
 from dexzoo.sim import Outcomes, trial
 
 SLICE_SCENES = 20
@@ -54,9 +57,21 @@ class Refining:
         """Name of the file of a slice."""
         return f"{self.name}_{number:05d}"
 
-    def describe(self) -> dict[str, str | int]:
-        """What the manifest says of how a round was made; of the evaluator, the checksum of its weights."""
-        return {"evaluator": load(self.evaluator).digest, "seed": self.seed, "num_grasps": self.num_grasps}
+    def describe(self, num_scenes: int) -> dict[str, Any]:
+        """What the manifest says of how a round was made; of the evaluator, the checksum of its weights.
+
+        num_scenes: training scenes of the set. Earlier rounds say evaluator, seed and num_grasps only.
+        """
+        return {
+            "evaluator": load(self.evaluator).digest,
+            "seed": self.seed,
+            "num_grasps": self.num_grasps,
+            "num_scenes": num_scenes,
+            "region": asdict(Region()),
+            "weights": asdict(Weights()),
+            "num_steps": NUM_STEPS,
+            "clearance": {"table": MIN_CLEARANCE, "around": AROUND, "lack": MAX_LACK},
+        }
 
 
 def collect_refined(folder: Path, how: Refining, workers: int = 1) -> Iterator[str]:
@@ -66,10 +81,12 @@ def collect_refined(folder: Path, how: Refining, workers: int = 1) -> Iterator[s
     workers. A refined grasp is paired with the view that it was refined on. Grasps that refinement did not replace are
     in the set already.
     Raises what `GraspSet`, `GraspSetWriter` and `dexzoo.load` raise, ValueError for a set without simulated training
-    scenes, or with a round of the same number that is another evaluator's.
+    scenes, or with a round of the same number that was made otherwise, such as by another evaluator or before the set
+    grew.
     """
-    made = how.describe()
-    numbers = slices(folder)
+    scenes = training_scenes(folder)
+    made = how.describe(len(scenes))
+    numbers = slices(scenes)
     with GraspSetWriter(folder, {}, 0) as writer:
         try:
             writer.settle(how.name, made)
@@ -85,14 +102,19 @@ def collect_refined(folder: Path, how: Refining, workers: int = 1) -> Iterator[s
                 yield f"{how.part(number)}: {table.num_rows} refined grasps, {held} of which hold"
 
 
-def slices(folder: Path) -> list[int]:
-    """Numbers of the slices that hold training scenes. ValueError where there are none."""
+def training_scenes(folder: Path) -> list[int]:
+    """Numbers of the training scenes. ValueError where there are none."""
     scenes = GraspSet(folder).scenes
     pairs = zip(scenes["scene"].to_pylist(), scenes["split"].to_pylist(), strict=True)
-    found = sorted({scene // SLICE_SCENES for scene, split in pairs if split == "train"})
+    found = [scene for scene, split in pairs if split == "train"]
     if not found:
         raise ValueError(f"grasp set {folder} has no scenes of training objects; only these are refined")
     return found
+
+
+def slices(scenes: list[int]) -> list[int]:
+    """Numbers of the slices that hold scenes of these numbers."""
+    return sorted({scene // SLICE_SCENES for scene in scenes})
 
 
 def make_slice(folder: Path, how: Refining, number: int) -> tuple[int, pa.Table]:

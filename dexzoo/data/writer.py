@@ -164,8 +164,10 @@ class GraspSetWriter:
     def settle(self, name: str, value: Mapping[str, Any]) -> None:
         """Add how a part is made to the configuration. ValueError if the same part was begun otherwise."""
         there = self.manifest["configuration"].setdefault(name, dict(value))
-        if there != value:
-            raise ValueError(f"{name} of grasp set {self.folder} was made with {there}, not {dict(value)}")
+        other = sorted(key for key in there.keys() | value.keys() if there.get(key) != value.get(key))
+        if other:
+            was, now = ({key: made.get(key) for key in other} for made in (there, value))
+            raise ValueError(f"{name} of grasp set {self.folder} was made with {was}, not {now}")
 
     def _write_table(self, name: str, shard: str, table: pa.Table, save: bool = True) -> None:
         path = self.folder / name / f"{shard}.parquet"

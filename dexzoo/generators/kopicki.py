@@ -81,15 +81,19 @@ class KopickiGenerator(GraspGenerator):
             self.demonstrations, self.models, surface, self.hand, self.num_kernels, self.widths, generator=generator
         )
 
-    def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
+    def generate(
+        self, observation: Observation, num_grasps: int = 100, seed: int = 0, density: GraspDensity | None = None
+    ) -> Grasps:
         """At most `num_grasps` grasps in the camera frame, the likeliest first, at most `num_per_type` of each type.
 
+        density: of the observation, where it is at hand; it is made from the seed if not given.
         Raises ValueError when too little of the object is seen, RuntimeError when no candidate is feasible.
         """
         if num_grasps < 1:
             raise ValueError(f"num_grasps is {num_grasps}, expected at least 1")
         generator = torch.Generator().manual_seed(seed)
-        density = self.density(observation, seed)
+        if density is None:
+            density = self.density(observation, seed)
         surface = density.surface.points
         others = torch.cat((obstacles(observation), underneath(surface)))
         way = Way(self.demonstrations, self.models, self.hand, surface, others, generator)

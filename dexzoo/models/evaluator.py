@@ -64,7 +64,7 @@ class TrainingOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class PreparedView:
-    """One observation, encoded once, ready to score any number of grasps.
+    """One observation, encoded once, ready to score any number of grasps, on any device and of any precision.
 
     T_aimed_world: (4, 4), world frame to the frame of the aimed camera.
     """
@@ -76,7 +76,7 @@ class PreparedView:
     def logit(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
         """Log-odds of success of grasps in the world frame; differentiable."""
         with self.evaluator.without_dropout():
-            return self.evaluator.logit(self.scene, self._aimed(waypoints))[0]
+            return self.evaluator.logit(self.scene, self._aimed(waypoints))[0].to(waypoints.device)
 
     def logit_and_spread(
         self, waypoints: Float[Tensor, "grasp 10 28"]
@@ -84,9 +84,10 @@ class PreparedView:
         """Log-odds of grasps in the world frame and their spread among members; both differentiable."""
         with self.evaluator.without_dropout():
             logit, spread = self.evaluator.logit_and_spread(self.scene, self._aimed(waypoints))
-        return logit[0], spread[0]
+        return logit[0].to(waypoints.device), spread[0].to(waypoints.device)
 
     def _aimed(self, waypoints: Tensor) -> Tensor:
+        waypoints = waypoints.to(self.T_aimed_world.device, self.evaluator.temperature.dtype)
         return transform_waypoints(self.T_aimed_world.to(waypoints), waypoints)[None]
 
 
@@ -179,7 +180,7 @@ class GraspEvaluator(LightningModule):
 
     def probability(self, logit: Tensor) -> Tensor:
         """Probability of success of log-odds as `logit` gives them: sigmoid(logit / temperature + offset)."""
-        return torch.sigmoid(logit / self.temperature + self.offset)
+        return torch.sigmoid(logit / self.temperature.to(logit.device) + self.offset.to(logit.device))
 
     def calibrate(self, logit: Float[Tensor, " grasp"], success: Float[Tensor, " grasp"]) -> None:
         """Fit temperature and offset by the likelihood of grasps that were not trained on.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from numbers import Integral
 
 import torch
 from jaxtyping import Bool, Float
@@ -47,8 +48,8 @@ class Settings:
         ):
             if value not in known:
                 raise ValueError(f"{what} {value!r} is unknown, use one of {', '.join(known)}")
-        if self.num_steps < 0:
-            raise ValueError(f"num_steps is {self.num_steps}, expected 0 or more")
+        if not isinstance(self.num_steps, Integral) or self.num_steps < 0:
+            raise ValueError(f"num_steps is {self.num_steps}, expected a whole number, 0 or more")
         if not 0 < self.step_size <= 1:
             raise ValueError(
                 f"a step_size of {self.step_size} leaves the trust region; give a share of it, above 0 and at most 1"
@@ -121,7 +122,7 @@ def _climb_chunk(
         OPTIMISERS[settings.optimiser](search, moves, num_steps, settings.step_size, draws)
         best, failed, after = search.best, failed | search.failed, search.terms
     rise = objective.value(after) - value
-    trace = Trace(torch.stack(states), torch.stack(values)) if keep_trace else None
+    trace = Trace(torch.stack([given, *states[1:]]), torch.stack(values)) if keep_trace else None
     return Climb(moved(best), before, after, rise, failed, trace)
 
 

@@ -76,7 +76,12 @@ def check(by: str, judged: bool) -> None:
         raise ValueError('ranking by "judge" needs a refinement with a judge')
 
 
+def best_first(score: Float[Tensor, " grasp"]) -> Tensor:
+    """Indices from the highest score to the lowest; ties stay in order, and what is no number comes last."""
+    return torch.where(score.isnan(), -torch.inf, score).argsort(descending=True, stable=True)
+
+
 def rank(result: Scored, by: str = "before") -> Tensor:
-    """Indices of the returned grasps, the best first; ties stay in order. ValueError for a rule that is not known."""
+    """Indices of the returned grasps, as `best_first` has them. ValueError for a rule that is not known."""
     check(by, result.judge_after is not None)
-    return RANKINGS[by](result).argsort(descending=True, stable=True)
+    return best_first(RANKINGS[by](result))

@@ -22,7 +22,7 @@ from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator, PreparedView
 from dexzoo.models.zoo import load
 from dexzoo.refinement.climb import CHUNK
-from dexzoo.refinement.method import Refinement, as_observation, checked_in_world, log_odds, replaced
+from dexzoo.refinement.method import Refinement, as_observation, check_gradient, checked_in_world, log_odds, replaced
 
 HALF_CUBE = 0.005
 """Metres along each axis that a wrist may move."""
@@ -53,35 +53,42 @@ def ascend(
 ) -> Refinement:
     """Refine as one of the `GROUPS` was; the arguments are those of `dexzoo.refine`.
 
-    A grasp whose log-odds are no finite number on the way is at its last state that has some. Raises ValueError for a
-    group that there is not, and what `dexzoo.refine` raises.
+    A grasp whose log-odds or gradient are no finite number on the way is at its last state that has log-odds. Raises
+    ValueError for a group that there is not, a step size that is no positive number, and what `dexzoo.refine` raises.
     """
     if group not in GROUPS:
         raise ValueError(f"group {group!r} is unknown, use one of {', '.join(GROUPS)}")
+    if not 0 < step_size < torch.inf:
+        raise ValueError(f"step_size is {step_size}, expected a positive number")
     observation = as_observation(depth, camera)
     world = checked_in_world(grasps, observation)
     model = load(evaluator) if isinstance(evaluator, str) else evaluator
     view = model.prepare(observation)
+    if len(world):
+        check_gradient(view, world[:1])
     parts = [_ascend(view, part, GROUPS[group], step_size) for part in world.split(CHUNK)]
     after, failed = (torch.cat(values) for values in zip(*parts, strict=True))
-    accepted = torch.ones_like(failed)
+    accepted = (after != world).flatten(1).any(1)
     before, then = (model.probability(log_odds(view, way)) for way in (world, after))
     return Refinement(replaced(grasps, after, accepted, observation), before, then, accepted, failed, {})
 
 
 def _ascend(view: PreparedView, start: Tensor, group: Group, step_size: float) -> tuple[Tensor, Tensor]:
-    """Waypoints (grasp, 10, 28) after the last step, and which grasps failed."""
+    """Waypoints (grasp, 10, 28) after the last good step, and which grasps failed."""
     hand = default_hand()
-    now, failed = start, torch.zeros(len(start), dtype=torch.bool)
+    now, good, failed = start, start, torch.zeros(len(start), dtype=torch.bool)
     scale = (torch.arange(NUM_WAYPOINTS) >= group.first)[:, None] * _SPREAD.square()
-    for _ in range(group.num_steps):
+    for _ in range(group.num_steps + 1):  # the last only looks at where the steps have led
         free = now.clone().requires_grad_()
         with torch.enable_grad():
             logit = view.logit(free)
             (gradient,) = torch.autograd.grad(logit.sum(), free)
-        failed |= ~(torch.isfinite(logit.detach()) & torch.isfinite(gradient).flatten(1).all(1))
-        moved = now + step_size * scale * torch.where(failed[:, None, None], 0.0, gradient)
+        known = torch.isfinite(logit.detach())
+        failed |= ~(known & torch.isfinite(gradient).flatten(1).all(1))
+        good = torch.where(known[:, None, None], now, good)
+        moved = now + step_size * scale * gradient
         position = start[..., POSITION] + (moved[..., POSITION] - start[..., POSITION]).clamp(-HALF_CUBE, HALF_CUBE)
         quaternion = rotation.normalize(moved[..., QUATERNION])
-        now = torch.cat((position, quaternion, hand.clamp(moved[..., JOINTS]), start[..., TYPE:]), -1)
-    return now, failed
+        moved = torch.cat((position, quaternion, hand.clamp(moved[..., JOINTS]), start[..., TYPE:]), -1)
+        now = torch.where(failed[:, None, None], good, moved)
+    return good, failed
