@@ -22,6 +22,7 @@ from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
 from dexzoo.grasp import JOINTS, SQUEEZE, Grasps
 from dexzoo.hand import default_hand
+from dexzoo.models.em1 import EM1
 from dexzoo.models.em2 import EM2
 from dexzoo.models.ensemble import Ensemble
 from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
@@ -143,6 +144,18 @@ def test_each_grasp_is_scored_in_its_own_view(data: GraspDataModule) -> None:
     assert np.ptp(scores.probability) > 0.02
 
 
+def test_dropout_is_off_where_a_model_is_scored_and_timed(
+    data: GraspDataModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = Closure().train()
+    modes = set()
+    logit = model.logit
+    monkeypatch.setattr(model, "logit", lambda *given: modes.add(model.training) or logit(*given))
+    compare({"right": model}, data)
+    assert modes == {False}
+    assert model.training
+
+
 def test_views_are_encoded_once_each(data: GraspDataModule, monkeypatch: pytest.MonkeyPatch) -> None:
     model = Closure()
     calls: list[int] = []
@@ -165,10 +178,11 @@ def test_a_split_without_generated_grasps_is_refused(data: GraspDataModule) -> N
 
 
 def test_models_are_named_shortly_where_that_is_clear(tmp_path: Path) -> None:
-    files = [EM2(width=16).save(tmp_path / name) for name in ("a", "b", "gm")]
+    files = [EM2(width=16).save(tmp_path / name) for name in ("a", "b", "gm", "em2-lr0.001")]
     assert list(load_models([str(tmp_path / "a"), str(tmp_path / "b"), str(tmp_path / "a")])) == ["a", "b"]
     assert list(load_models([str(path) for path in files])) == [str(path) for path in files]
     assert list(load_models([str(tmp_path / "gm")])) == [str(tmp_path / "gm")]
+    assert list(load_models([str(tmp_path / "em2-lr0.001"), str(files[0])])) == ["em2-lr0.001", "em2"]
     assert "em2" in load_models([])
 
 
@@ -221,8 +235,12 @@ def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
     assert feature_maps(Closure(), image) is None
     dataset = data.dataset("test", em2)
     rows, features = grasp_features(em2, dataset)
-    branch = em2.hand_branch(em2.grasp_vector(dataset.aimed(rows[:3]))[:, None])
-    torch.testing.assert_close(features[:3], branch.flatten(1), atol=1e-4, rtol=1e-4)
+    joined = []
+    em2.head.register_forward_hook(lambda _, given, __: joined.append(given[0][..., -512:]))
+    em2.logit(em2.encode(image), dataset.aimed(rows[:3])[None])
+    torch.testing.assert_close(features[:3], joined[0][0], atol=1e-4, rtol=1e-4)
+    em1 = EM1().eval()
+    assert grasp_features(em1, data.dataset("test", em1))[1].shape == (len(rows), 1024)
     rows, features = grasp_features(Closure(), dataset)
     hand = default_hand()
     share = (hand.reduce(dataset.world_grasps[rows, SQUEEZE, JOINTS]) - hand.reduce(hand.lower)) / hand.reduce(

@@ -75,6 +75,7 @@ def test_the_cost_is_that_of_all_members(
     monkeypatch.setattr(scores, "NUM_TIMED", 6)
     image, waypoints = view.aimed().image()[None], grasps.waypoints
     every = [scores.measure(zoo.load(member), image, waypoints) for member in members]
+    assert [one.megabytes for one in every] == [round(Path(member).stat().st_size / 1e6, 1) for member in members]
     pair = Ensemble(members=members[:2]).save(tmp_path)
     for ensemble in (Ensemble(members=members), Ensemble(members=[str(pair), members[2]])):
         cost = scores.measure(ensemble.eval(), image, waypoints)

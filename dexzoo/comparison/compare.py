@@ -32,13 +32,13 @@ GENERATED = SOURCES[0]
 
 
 def load_models(models: Sequence[str]) -> dict[str, GraspEvaluator]:
-    """Models by the names of their rows: the last part of a path, or the whole where that is taken.
+    """Models by the names of their rows: the last part of a path, without .safetensors, or the whole where it is taken.
 
     models: names, files, folders or addresses, as `dexzoo.load` takes them; one given twice is loaded once, and if none
     is given, all that come with weights are.
     """
     models = list(dict.fromkeys(models)) or [name for name in list_models() if shipped_card(name)]
-    short = [Path(model).stem for model in models]
+    short = [Path(model).name.removesuffix(".safetensors") for model in models]
     taken = [*short, GM, COIN]
     names = [name if taken.count(name) == 1 else model for name, model in zip(short, models, strict=True)]
     return {name: load(model) for name, model in zip(names, models, strict=True)}

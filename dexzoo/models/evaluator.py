@@ -103,7 +103,8 @@ class GraspEvaluator(LightningModule):
     temperature: Tensor
     offset: Tensor
     sha256: str | None = None
-    """Of the file that `dexzoo.load` read; None for a model that was made otherwise."""
+    num_bytes: int | None = None
+    """Both of the file that `dexzoo.load` read; None for a model that was made otherwise."""
     frozen_encoder: ClassVar[bool] = False
     """Whether `encode` has nothing to train, so that its result can be kept for the next epoch and on disk."""
 
@@ -304,7 +305,7 @@ class GraspEvaluator(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take up the random state at the next step, and the best so far, though a resumed run has its own folder.
 
-        Settings stay as configured: those of the optimiser, unless a schedule moves them, and early stopping's patience.
+        Settings stay as configured: early stopping's patience and, unless a schedule moves them, the optimiser's.
         """
         self._random_state = checkpoint["random_state"]
         for callback in self.trainer.checkpoint_callbacks:

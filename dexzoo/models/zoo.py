@@ -141,7 +141,7 @@ def _read(path: Path) -> GraspEvaluator:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path.with_suffix('.json')}: {cls.__name__} refuses its arguments: {error}") from None
     load_weights(evaluator, weights, path)
-    evaluator.sha256 = sha256
+    evaluator.sha256, evaluator.num_bytes = sha256, path.stat().st_size
     return evaluator.eval()
 
 
