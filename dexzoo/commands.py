@@ -265,6 +265,7 @@ def _view(options: Namespace) -> Result:
 
 def _models(options: Namespace) -> Result:
     rows = []
+    missing = []
     table = Table(title="evaluative models", caption_justify="left")
     for heading in ("name", "what", "weights", "validation AUROC"):
         table.add_column(heading)
@@ -274,7 +275,9 @@ def _models(options: Namespace) -> Result:
         auroc = None if card is None else card.get("metrics", {}).get("validation_auroc")
         rows.append({"name": name, "what": what, "shipped": card is not None, "validation_auroc": auroc})
         table.add_row(name, what, "none" if card is None else "shipped", "" if auroc is None else f"{auroc:.3f}")
-    table.caption = "\n".join(f"{row['name']}: {how_to_get(row['name'])}" for row in rows if not row["shipped"])
+        if card is None:
+            missing.append(f"{name}: {how_to_get(name)}")
+    table.caption = "\n".join(missing)
     return {"models": rows}, table
 
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from dexzoo.comparison.compare import compare, load_models
 from dexzoo.comparison.inside import draw_inside, feature_maps, grasp_features, principal_components
-from dexzoo.comparison.report import main_table, markdown, write
+from dexzoo.comparison.report import advice, main_table, markdown, terminal_table, write
 from dexzoo.comparison.scores import encoded_views, model_scores
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
@@ -209,6 +209,62 @@ def test_the_best_of_a_column_is_bold(data: GraspDataModule, models: dict[str, G
         assert not wrong[head.index(name)].startswith("**"), name
     assert right[head.index("accuracy")] == "**100.0** (100.0 to 100.0)"
     assert gm[head.index("Brier")] == ""
+
+
+def summary(top1: dict[str, float], held: tuple[int, int], p: float) -> dict[str, Any]:
+    """What `advice` reads of a result: rows with their top-1, and the first set against the second."""
+    best, other, *_ = top1
+    rows: dict[str, Any] = {name: {"figures": {"top1": {"value": value}}} for name, value in top1.items()}
+    cross = {"only_this": held[0], f"only_{other}": held[1], "p": p}
+    rows[best][f"against_{other}"] = {"top1": cross | {"difference": {"value": top1[best] - top1[other]}}}
+    cost = {
+        name: {"milliseconds_per_view": 40, "milliseconds_per_1000_grasps": 1000 * value}
+        for name, value in top1.items()
+    }
+    return {"sources": {"generated": {"rows": rows}}, "cost": cost}
+
+
+@pytest.mark.parametrize(
+    ("top1", "held", "p", "before", "after"),
+    [
+        (
+            {"a": 0.9, "b": 0.8, "gm": 0.5, "coin": 0.95},
+            (40, 12),
+            0.0003,
+            "Use a: a's first grasp holds in 90.0 % of the scenes, 10.0 points more than b's (only a's in 40 scenes, ",
+            "only b's in 12), which is beyond chance (p 0.0003).",
+        ),
+        (
+            {"a": 0.9, "b": 0.8, "gm": 0.5},
+            (5, 2),
+            0.4531,
+            "Use b: a's first grasp holds in 90.0 % of the scenes, 10.0 points more than b's (only a's in 5 scenes, ",
+            "only b's in 2), which may be chance (p 0.4531), and b is the quicker, 840 ms for a view and 1,000 grasps "
+            "against 940.",
+        ),
+        (
+            {"a": 0.4, "gm": 0.5},
+            (2, 30),
+            1e-6,
+            "a's first grasp holds in 40.0 % of the scenes, 10.0 points less than gm's (only a's in 2 scenes, only ",
+            "gm's in 30), which is beyond chance (p < 0.0001).",
+        ),
+    ],
+)
+def test_a_sentence_says_which_to_use(
+    top1: dict[str, float], held: tuple[int, int], p: float, before: str, after: str
+) -> None:
+    assert advice(summary(top1, held, p)) == before + after
+
+
+def test_the_best_is_set_against_the_next(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
+    result = compare({"wrong": models["wrong"], "right": models["right"]}, data)
+    rows = result["sources"]["generated"]["rows"]
+    assert rows["right"]["against_wrong"]["top1"]["only_this"] == 5
+    assert "against_right" not in rows["wrong"]
+    assert advice(result) in markdown(result)
+    assert advice(result) == terminal_table(result).caption
+    assert advice(compare({}, data)) == ""
 
 
 def test_all_are_set_against_em2_where_it_is_compared(
