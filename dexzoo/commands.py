@@ -30,7 +30,7 @@ from dexzoo.generators.demonstration import SHIPPED, Demonstration
 from dexzoo.generators.preshape import close, read_preshapes, read_recording
 from dexzoo.grasp import GRASP_TYPES, GRIP, Grasps
 from dexzoo.hand import default_hand
-from dexzoo.models.zoo import list_models, model_class, shipped_card
+from dexzoo.models.zoo import how_to_get, list_models, model_class, shipped_card
 from dexzoo.planning import Plan, plan
 from dexzoo.refinement import rank, refine
 from dexzoo.sim import ObjectModel, Scene
@@ -284,7 +284,8 @@ def _view(options: Namespace) -> Result:
 
 def _models(options: Namespace) -> Result:
     rows = []
-    table = Table(title="evaluative models")
+    missing = []
+    table = Table(title="evaluative models", caption_justify="left")
     for heading in ("name", "what", "weights", "validation AUROC"):
         table.add_column(heading)
     for name in list_models():
@@ -292,8 +293,10 @@ def _models(options: Namespace) -> Result:
         card = shipped_card(name)
         auroc = None if card is None else card.get("metrics", {}).get("validation_auroc")
         rows.append({"name": name, "what": what, "shipped": card is not None, "validation_auroc": auroc})
-        weights = f"none; fit --config {name}.yaml" if card is None else "shipped"
-        table.add_row(name, what, weights, "" if auroc is None else f"{auroc:.3f}")
+        table.add_row(name, what, "none" if card is None else "shipped", "" if auroc is None else f"{auroc:.3f}")
+        if card is None:
+            missing.append(f"{name}: {how_to_get(name)}")
+    table.caption = "\n".join(missing)
     return {"models": rows}, table
 
 

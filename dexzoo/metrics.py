@@ -29,8 +29,10 @@ class SceneMetric(Metric):
     """Base of the metrics that rank the grasps of each scene and average over scenes. A subclass adds `by_scene`.
 
     `update` takes preds (num_grasps,) scores of any monotonic scale, target (num_grasps,) successes 0 or 1 and indexes
-    (num_grasps,) integers that name the scene; grasps of one scene may come in several calls and in any order. Among
-    equal scores the one that came first ranks higher. Scenes without a figure, nan, are left out of the average.
+    (num_grasps,) integers that name the scene; grasps of one scene may come in several calls and in any order. Equal
+    scores rank in an order that is drawn over all grasps with one fixed seed: by the order in which they come, often
+    the generator's, a constant score would be as good as the generator. Scenes without a figure, nan, are left out of
+    the average.
     """
 
     is_differentiable = False
@@ -67,7 +69,8 @@ class SceneMetric(Metric):
 
     def _ranked(self) -> _Ranking:
         preds, target, indexes = (dim_zero_cat(state) for state in (self.preds, self.target, self.indexes))
-        order = preds.argsort(descending=True, stable=True)
+        order = torch.randperm(len(preds), generator=torch.Generator().manual_seed(0)).to(preds.device)
+        order = order[preds[order].argsort(descending=True, stable=True)]
         order = order[indexes[order].argsort(stable=True)]
         _, scene, size = indexes[order].unique_consecutive(return_inverse=True, return_counts=True)
         start = size.cumsum(0) - size

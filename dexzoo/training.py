@@ -141,9 +141,14 @@ class CommandLine(LightningCLI):
 
     def _load(self, ckpt_path: str | None) -> None:
         """Put the weights that --ckpt_path names into the model."""
-        if ckpt_path is not None:
-            weights = read_checkpoint(ckpt_path) if _is_checkpoint(ckpt_path) else load(ckpt_path).state_dict()
-            load_weights(self.model, weights, ckpt_path)
+        if ckpt_path is None:
+            return
+        if _is_checkpoint(ckpt_path):
+            load_weights(self.model, read_checkpoint(ckpt_path), ckpt_path)
+            return
+        loaded = load(ckpt_path)
+        arguments = loaded.arguments if type(loaded) is type(self.model) else None
+        load_weights(self.model, loaded.state_dict(), ckpt_path, arguments)
 
     @torch.no_grad()
     def _calibrate(self) -> None:

@@ -24,7 +24,7 @@ from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import GRASP_TYPES, Grasps
 from dexzoo.models.em2 import EM2
 from dexzoo.models.evaluator import Scene
-from dexzoo.models.zoo import list_models
+from dexzoo.models.zoo import how_to_get, list_models
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -239,6 +239,7 @@ def test_models_are_listed(run: Run) -> None:
     status, out, err = run("models")
     assert (status, err) == (0, "")
     assert all(name in out for name in list_models())
+    assert how_to_get("ensemble") in " ".join(out.split())
 
 
 # help

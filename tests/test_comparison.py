@@ -16,12 +16,13 @@ from torch import Tensor, nn
 
 from dexzoo.comparison.compare import compare, load_models
 from dexzoo.comparison.inside import draw_inside, feature_maps, grasp_features, principal_components
-from dexzoo.comparison.report import main_table, markdown, write
+from dexzoo.comparison.report import advice, main_table, markdown, terminal_table, write
 from dexzoo.comparison.scores import encoded_views, model_scores
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
 from dexzoo.grasp import JOINTS, SQUEEZE, Grasps
 from dexzoo.hand import default_hand
+from dexzoo.models.em1 import EM1
 from dexzoo.models.em2 import EM2
 from dexzoo.models.ensemble import Ensemble
 from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
@@ -143,6 +144,18 @@ def test_each_grasp_is_scored_in_its_own_view(data: GraspDataModule) -> None:
     assert np.ptp(scores.probability) > 0.02
 
 
+def test_dropout_is_off_where_a_model_is_scored_and_timed(
+    data: GraspDataModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = Closure().train()
+    modes = set()
+    logit = model.logit
+    monkeypatch.setattr(model, "logit", lambda *given: modes.add(model.training) or logit(*given))
+    compare({"right": model}, data)
+    assert modes == {False}
+    assert model.training
+
+
 def test_views_are_encoded_once_each(data: GraspDataModule, monkeypatch: pytest.MonkeyPatch) -> None:
     model = Closure()
     calls: list[int] = []
@@ -165,10 +178,11 @@ def test_a_split_without_generated_grasps_is_refused(data: GraspDataModule) -> N
 
 
 def test_models_are_named_shortly_where_that_is_clear(tmp_path: Path) -> None:
-    files = [EM2(width=16).save(tmp_path / name) for name in ("a", "b", "gm")]
+    files = [EM2(width=16).save(tmp_path / name) for name in ("a", "b", "gm", "em2-lr0.001")]
     assert list(load_models([str(tmp_path / "a"), str(tmp_path / "b"), str(tmp_path / "a")])) == ["a", "b"]
     assert list(load_models([str(path) for path in files])) == [str(path) for path in files]
     assert list(load_models([str(tmp_path / "gm")])) == [str(tmp_path / "gm")]
+    assert list(load_models([str(tmp_path / "em2-lr0.001"), str(files[0])])) == ["em2-lr0.001", "em2"]
     assert "em2" in load_models([])
 
 
@@ -197,6 +211,62 @@ def test_the_best_of_a_column_is_bold(data: GraspDataModule, models: dict[str, G
     assert gm[head.index("Brier")] == ""
 
 
+def summary(top1: dict[str, float], held: tuple[int, int], p: float) -> dict[str, Any]:
+    """What `advice` reads of a result: rows with their top-1, and the first set against the second."""
+    best, other, *_ = top1
+    rows: dict[str, Any] = {name: {"figures": {"top1": {"value": value}}} for name, value in top1.items()}
+    cross = {"only_this": held[0], f"only_{other}": held[1], "p": p}
+    rows[best][f"against_{other}"] = {"top1": cross | {"difference": {"value": top1[best] - top1[other]}}}
+    cost = {
+        name: {"milliseconds_per_view": 40, "milliseconds_per_1000_grasps": 1000 * value}
+        for name, value in top1.items()
+    }
+    return {"sources": {"generated": {"rows": rows}}, "cost": cost}
+
+
+@pytest.mark.parametrize(
+    ("top1", "held", "p", "before", "after"),
+    [
+        (
+            {"a": 0.9, "b": 0.8, "gm": 0.5, "coin": 0.95},
+            (40, 12),
+            0.0003,
+            "Use a: a's first grasp holds in 90.0 % of the scenes, 10.0 points more than b's (only a's in 40 scenes, ",
+            "only b's in 12), which is beyond chance (p 0.0003).",
+        ),
+        (
+            {"a": 0.9, "b": 0.8, "gm": 0.5},
+            (5, 2),
+            0.4531,
+            "Use b: a's first grasp holds in 90.0 % of the scenes, 10.0 points more than b's (only a's in 5 scenes, ",
+            "only b's in 2), which may be chance (p 0.4531), and b is the quicker, 840 ms for a view and 1,000 grasps "
+            "against 940.",
+        ),
+        (
+            {"a": 0.4, "gm": 0.5},
+            (2, 30),
+            1e-6,
+            "a's first grasp holds in 40.0 % of the scenes, 10.0 points less than gm's (only a's in 2 scenes, only ",
+            "gm's in 30), which is beyond chance (p < 0.0001).",
+        ),
+    ],
+)
+def test_a_sentence_says_which_to_use(
+    top1: dict[str, float], held: tuple[int, int], p: float, before: str, after: str
+) -> None:
+    assert advice(summary(top1, held, p)) == before + after
+
+
+def test_the_best_is_set_against_the_next(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
+    result = compare({"wrong": models["wrong"], "right": models["right"]}, data)
+    rows = result["sources"]["generated"]["rows"]
+    assert rows["right"]["against_wrong"]["top1"]["only_this"] == 5
+    assert "against_right" not in rows["wrong"]
+    assert advice(result) in markdown(result)
+    assert advice(result) == terminal_table(result).caption
+    assert advice(compare({}, data)) == ""
+
+
 def test_all_are_set_against_em2_where_it_is_compared(
     data: GraspDataModule, models: dict[str, GraspEvaluator], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -221,8 +291,12 @@ def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
     assert feature_maps(Closure(), image) is None
     dataset = data.dataset("test", em2)
     rows, features = grasp_features(em2, dataset)
-    branch = em2.hand_branch(em2.grasp_vector(dataset.aimed(rows[:3]))[:, None])
-    torch.testing.assert_close(features[:3], branch.flatten(1), atol=1e-4, rtol=1e-4)
+    joined = []
+    em2.head.register_forward_hook(lambda _, given, __: joined.append(given[0][..., -512:]))
+    em2.logit(em2.encode(image), dataset.aimed(rows[:3])[None])
+    torch.testing.assert_close(features[:3], joined[0][0], atol=1e-4, rtol=1e-4)
+    em1 = EM1().eval()
+    assert grasp_features(em1, data.dataset("test", em1))[1].shape == (len(rows), 1024)
     rows, features = grasp_features(Closure(), dataset)
     hand = default_hand()
     share = (hand.reduce(dataset.world_grasps[rows, SQUEEZE, JOINTS]) - hand.reduce(hand.lower)) / hand.reduce(

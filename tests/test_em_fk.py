@@ -211,6 +211,8 @@ def test_each_ingredient_can_be_left_out(without: str, grasps: Grasps) -> None:
     scene = model.encode(view.image()[None])
     assert model.look(scene, camera_grasps(grasps, view)).shape == (1, 12, 4, 19, 6, size)
     assert model.score(view, grasps).shape == (12,)
+    model.logit(model.encode(view.image()[None]), camera_grasps(grasps, view)).sum().backward()
+    assert not [name for name, parameter in model.named_parameters() if parameter.grad is None]  # which ddp refuses
 
 
 def test_it_is_small() -> None:

@@ -75,6 +75,7 @@ def test_the_cost_is_that_of_all_members(
     monkeypatch.setattr(scores, "NUM_TIMED", 6)
     image, waypoints = view.aimed().image()[None], grasps.waypoints
     every = [scores.measure(zoo.load(member), image, waypoints) for member in members]
+    assert [one.megabytes for one in every] == [round(Path(member).stat().st_size / 1e6, 1) for member in members]
     pair = Ensemble(members=members[:2]).save(tmp_path)
     for ensemble in (Ensemble(members=members), Ensemble(members=[str(pair), members[2]])):
         cost = scores.measure(ensemble.eval(), image, waypoints)
@@ -97,6 +98,11 @@ def test_a_saved_ensemble_is_a_list_of_members(
 def test_members_that_are_not_there_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"weights .*gone\.safetensors do not exist"):
         Ensemble(members=[str(tmp_path / "gone.safetensors")])
+    gone = FFH(width=8).save(tmp_path / "gone.safetensors")
+    saved = Ensemble(members=[str(gone)]).save(tmp_path / "both")
+    gone.unlink()
+    with pytest.raises(FileNotFoundError, match=r"both.ensemble\.json names what .*gone\.safetensors do not exist"):
+        zoo.load(saved)
     with pytest.raises(ValueError, match="needs at least one member"):
         Ensemble(members=[])
     with pytest.raises(FileNotFoundError, match=r"make one of trained models with Ensemble\(members="):

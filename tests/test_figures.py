@@ -17,7 +17,7 @@ from dexzoo.comparison.scores import Labels, Scores, best_threshold, coin_scores
 
 
 def make(seed: int, num_scenes: int = 12, size: int = 150, digits: int = 1) -> tuple[Labels, Scores]:
-    """Grasps in no order, scored better than by chance, with ties."""
+    """Grasps in no order, scored better than by chance, with ties where the scores have few digits."""
     rng = np.random.default_rng(seed)
     scene = np.concatenate((np.arange(num_scenes), rng.integers(0, num_scenes, size - num_scenes)))
     success = rng.random(size) < 0.45
@@ -41,23 +41,25 @@ def expected(labels: Labels, scores: Scores, weight: np.ndarray) -> dict[str, fl
     }
 
 
-@given(st.integers(0, 10_000))
-def test_figures_agree_with_scikit_learn_and_torchmetrics(seed: int) -> None:
-    labels, scores = make(seed)
+@given(st.integers(0, 10_000), st.sampled_from([1, 9]))
+def test_figures_agree_with_scikit_learn_and_torchmetrics(seed: int, digits: int) -> None:
+    labels, scores = make(seed, digits=digits)
     found = figures(labels, scores, np.ones((1, labels.num_scenes)))
     for name, value in expected(labels, scores, np.ones(len(labels.success))).items():
         assert found[name][0] == pytest.approx(value, abs=1e-6), name
     error = BinaryCalibrationError(NUM_BINS)(torch.tensor(scores.probability), torch.tensor(labels.success).int())
     assert found["calibration_error"][0] == pytest.approx(float(error), abs=1e-6)
+    if digits == 1:
+        return  # among ties chance ranks
     scenes = [np.flatnonzero(labels.scene == i) for i in range(labels.num_scenes)]
-    ranked = [rows[np.argsort(-scores.score[rows], kind="stable")] for rows in scenes]
+    ranked = [rows[np.argsort(-scores.score[rows])] for rows in scenes]
     for k in (1, 5):
         assert found[f"top{k}"][0] == pytest.approx(np.mean([labels.success[rows[:k]].mean() for rows in ranked]))
 
 
-@given(st.integers(0, 10_000))
-def test_a_scene_drawn_twice_counts_twice(seed: int) -> None:
-    labels, scores = make(seed)
+@given(st.integers(0, 10_000), st.sampled_from([1, 9]))
+def test_a_scene_drawn_twice_counts_twice(seed: int, digits: int) -> None:
+    labels, scores = make(seed, digits=digits)
     draws = draw_scenes(labels.num_scenes, seed, 3)
     found = figures(labels, scores, draws)
     for draw, weights in enumerate(draws):
@@ -71,6 +73,8 @@ def test_a_scene_drawn_twice_counts_twice(seed: int) -> None:
         )
         once = figures(copied, scores[taken], np.ones((1, len(copies))))
         for name, value in once.items():
+            if digits == 1 and name in ("top1", "top5"):
+                continue  # among ties chance ranks
             assert found[name][draw] == pytest.approx(value[0], abs=1e-6, nan_ok=True), name
 
 

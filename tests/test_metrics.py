@@ -20,7 +20,7 @@ def reference(scores: np.ndarray, success: np.ndarray, scene: np.ndarray, k: int
     rates = []
     for name in np.unique(scene):
         rows = np.flatnonzero(scene == name)
-        best = rows[np.argsort(-scores[rows], kind="stable")[:k]]
+        best = rows[np.argsort(-scores[rows])[:k]]
         rates.append(success[best].mean())
     return float(np.mean(rates))
 
@@ -28,12 +28,27 @@ def reference(scores: np.ndarray, success: np.ndarray, scene: np.ndarray, k: int
 @given(st.integers(0, 10_000), st.integers(1, 60), st.integers(1, 8), st.integers(1, 5), st.integers(1, 4))
 def test_top_k_agrees_with_numpy_however_the_grasps_come(seed: int, size: int, scenes: int, k: int, calls: int) -> None:
     rng = np.random.default_rng(seed)
-    scores = np.round(rng.random(size), 1).astype(np.float32)  # rounded, so that there are ties
+    scores = rng.permutation(size).astype(np.float32)  # without ties
     success, scene = rng.integers(0, 2, size), rng.integers(0, scenes, size) * 7
     metric = TopKSuccess(k)
     for part in np.array_split(np.arange(size), calls):
         metric.update(torch.tensor(scores[part]), torch.tensor(success[part]), torch.tensor(scene[part]))
     assert float(metric.compute()) == pytest.approx(reference(scores, success, scene, k), abs=1e-6)
+
+
+@pytest.mark.parametrize("calls", [1, 3])
+def test_a_constant_score_is_as_good_as_chance(calls: int) -> None:
+    success = np.random.default_rng(0).random((500, 10)) < np.linspace(0.9, 0.1, 10)  # as a generator orders them
+    success, scene = torch.tensor(success.ravel()), torch.arange(500).repeat_interleave(10)
+    metrics = [TopKSuccess(1), TopKSuccess(5), SuccessByRank(5), SceneAUROC()]
+    for metric in metrics:
+        for part in torch.arange(5000).chunk(calls):
+            metric.update(torch.full((len(part),), 0.3), success[part], scene[part])
+        figures = metric.compute()
+        torch.testing.assert_close(figures, torch.full_like(figures, 0.5), atol=0.06, rtol=0)
+    again = TopKSuccess(1)
+    again.update(torch.zeros(5000), success, scene)
+    assert again.compute() == metrics[0].compute()
 
 
 def test_processes_are_joined_by_concatenation() -> None:
@@ -67,12 +82,12 @@ def test_wrong_use_is_refused() -> None:
 @given(st.integers(0, 10_000), st.integers(1, 60), st.integers(1, 8), st.integers(1, 12))
 def test_success_by_rank_agrees_with_numpy(seed: int, size: int, scenes: int, parts: int) -> None:
     rng = np.random.default_rng(seed)
-    scores = np.round(rng.random(size), 1).astype(np.float32)
+    scores = rng.permutation(size).astype(np.float32)  # without ties
     success, scene = rng.integers(0, 2, size), rng.integers(0, scenes, size) * 7
     rates: list[list[float]] = [[] for _ in range(parts)]
     for name in np.unique(scene):
         rows = np.flatnonzero(scene == name)
-        ranked = success[rows[np.argsort(-scores[rows], kind="stable")]]
+        ranked = success[rows[np.argsort(-scores[rows])]]
         for part in range(parts):
             here = [held for place, held in enumerate(ranked) if int(place * parts / len(ranked)) == part]
             rates[part] += [np.mean(here)] if here else []

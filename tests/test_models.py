@@ -23,6 +23,7 @@ from dexzoo.grasp import POSITION, QUATERNION, Grasps
 from dexzoo.models import encoders, evaluator, trunks, zoo
 from dexzoo.models.em1 import EM1
 from dexzoo.models.em2 import EM2
+from dexzoo.models.em_fk import EMFK
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.resources import resource
 
@@ -437,8 +438,15 @@ def test_calls_that_are_wrong_get_one_line(arguments: list[str], tmp_path: Path)
     wrong.append((["test", *SMOKE, *arguments, "--ckpt_path", str(bad)], "is not what fit writes, refused"))
     EM2(width=8).save(tmp_path / "narrow.safetensors")
     other = ["test", *SMOKE, *arguments, "--ckpt_path", str(tmp_path / "narrow.safetensors")]
-    sizes = r"narrow\.safetensors holds another architecture than em2 .*, 8 in the file and 64 as configured"
+    sizes = r"narrow\.safetensors holds another architecture than em2 .*by width, 8 in the file and 64 as configured;"
     wrong.append((other, sizes))
+    EMFK(width=64, cloud=False, dropout=0.3).save(tmp_path / "blind.safetensors")
+    both = (
+        "than em_fk .*by width, 64 in the file and 128 as configured; cloud, False in the file and True as configured;"
+    )
+    blind = ["--config=em_fk.yaml", *arguments, "--ckpt_path", str(tmp_path / "blind.safetensors")]
+    wrong.append((["fit", *blind], both))
+    wrong.append((["test", *SMOKE, *arguments, *blind[-2:]], "than em2 as configured, by [0-9]+ tensors such as"))
     for args, message in wrong:
         with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
             training.main(args)
@@ -542,11 +550,14 @@ def test_names_and_places_that_do_not_exist(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(ValueError, match=r"needs huggingface_hub; install it with `pip install dexzoo\[hub\]`"):
         zoo.load("hf://someone/em2")
-    monkeypatch.setattr(zoo, "resource", lambda name: tmp_path)
-    with pytest.raises(
-        FileNotFoundError, match=r"model em1 comes without weights; train them with .*--config em1\.yaml"
+    monkeypatch.setattr(zoo, "resource", lambda name: tmp_path if name == "checkpoints" else resource(name))
+    for name, how in (
+        ("em1", r"train them with .*--config em1-adamw\.yaml"),
+        ("ffh", r"train them with .*--config ffh\.yaml"),
+        ("em3", r"make its trunk by .*train_resnet50\.py`, then train them with .*--config em3\.yaml"),
     ):
-        zoo.load("em1")
+        with pytest.raises(FileNotFoundError, match=f"model {name} comes without weights; {how}"):
+            zoo.load(name)
 
 
 def test_a_hub_repository_is_a_folder(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:

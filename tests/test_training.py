@@ -91,6 +91,22 @@ def test_a_resumed_run_remembers_the_best_before_the_kill(
     assert (before / "checkpoints" / "best.ckpt").is_file()
 
 
+def test_a_resumed_run_takes_the_settings_that_are_typed(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    stopping = ["--trainer.callbacks+=EarlyStopping", "--trainer.callbacks.monitor=validation_auroc"]
+    before = fit([*arguments, *stopping, "--trainer.callbacks.patience=30"], capsys)
+    more = ["--trainer.max_steps=16", "--trainer.callbacks.patience=20", "--model.learning_rate=1e-5"]
+    left = str(before / "checkpoints" / "last.ckpt")
+    after = fit([*arguments, *stopping, *more, "--model.weight_decay=0.3", "--ckpt_path", left], capsys)
+    checkpoint = torch.load(after / "checkpoints" / "last.ckpt", weights_only=True)
+    assert checkpoint["global_step"] == 16
+    (group,) = checkpoint["optimizer_states"][0]["param_groups"]
+    assert (group["lr"], group["weight_decay"]) == (1e-5, 0.3)
+    (state,) = [one for key, one in checkpoint["callbacks"].items() if key.startswith("EarlyStopping")]
+    assert (state["patience"], state["wait_count"] > 0) == (20, True)
+
+
 def drawn_from(success: torch.Tensor, scene: torch.Tensor) -> GraspDataset:
     """Grasps of scenes with as many views as the scene's number modulo 3, and one."""
     view_scene = torch.tensor([number for number in scene.unique().tolist() for _ in range(1 + number % 3)])

@@ -90,6 +90,15 @@ def test_weights_that_cannot_be_had_are_named(monkeypatch: pytest.MonkeyPatch, t
         trunks.load_trunk("resnet50")
 
 
+def test_each_trunk_is_loaded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    trunks.load_trunk.cache_clear()
+    for name in trunks.TRUNKS:
+        monkeypatch.setitem(trunks.TRUNKS, name, trunks.Trunk(1, 1.0, torch.nn.Identity, dict))
+    first, again = ([trunks.load_trunk(name) for name in trunks.TRUNKS] for _ in range(2))
+    trunks.load_trunk.cache_clear()
+    assert all(a is b for a, b in zip(first, again, strict=True))
+
+
 def test_packed_weights_come_back_within_half_a_step(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     whole = {
         name: torch.randn_like(value.float()) for name, value in trunks.TRUNKS["lite0"].build().state_dict().items()

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from dexzoo.comparison.figures import NUM_DRAWS, against, describe, draw_scenes
+from dexzoo.comparison.figures import NUM_DRAWS, against, best_first, describe, draw_scenes
 from dexzoo.comparison.scores import (
     COIN,
     EM2,
@@ -32,13 +32,13 @@ GENERATED = SOURCES[0]
 
 
 def load_models(models: Sequence[str]) -> dict[str, GraspEvaluator]:
-    """Models by the names of their rows: the last part of a path, or the whole where that is taken.
+    """Models by the names of their rows: the last part of a path, without .safetensors, or the whole where it is taken.
 
     models: names, files, folders or addresses, as `dexzoo.load` takes them; one given twice is loaded once, and if none
     is given, all that come with weights are.
     """
     models = list(dict.fromkeys(models)) or [name for name in list_models() if shipped_card(name)]
-    short = [Path(model).stem for model in models]
+    short = [Path(model).name.removesuffix(".safetensors") for model in models]
     taken = [*short, GM, COIN]
     names = [name if taken.count(name) == 1 else model for name, model in zip(short, models, strict=True)]
     return {name: load(model) for name, model in zip(names, models, strict=True)}
@@ -55,9 +55,10 @@ def compare(
     Returns plain values, ready for JSON: split, seed, num_draws; data (version and checksum of the set); weights, by
     model, checksums of its file and of its members', None for one that was not read from a file; sources, for
     generated grasps and, where the split has some, for perturbed and refined ones: how many grasps, objects and scenes,
-    the success rate, and in `rows`, by name, what `figures.describe` and `figures.against` say; cost, by model. Ranks
-    are within the grasps of one source in one scene, each seen in the view that the set pairs it with. There is no row
-    gm where the set has no likelihoods; its threshold is the most accurate one for the generated grasps of validation.
+    the success rate, and in `rows`, by name, what `figures.describe` and `figures.against` say, the latter of gm, em2
+    and, for the model with the highest top-1, of the next; cost, by model. Ranks are within the grasps of one source in
+    one scene, each seen in the view that the set pairs it with. There is no row gm where the set has no likelihoods;
+    its threshold is the most accurate one for the generated grasps of validation.
 
     Raises FileNotFoundError or ValueError for a set that cannot be had, or a split without generated grasps.
     """
@@ -91,15 +92,16 @@ def _section(labels: Labels, rows: dict[str, Scores], validation: Labels | None,
     reference = {} if likelihood is None else {GM: likelihood}
     rows = {**rows, **reference, COIN: coin_scores(labels, seed)}
     draws = draw_scenes(labels.num_scenes, seed)
-    others = [name for name in (GM, EM2) if name in rows]
+    described = {name: describe(labels, scores, draws) for name, scores in rows.items()}
+    best, second = [*best_first(described), None, None][:2]
+    for name, scores in rows.items():
+        others = dict.fromkeys([GM, EM2, *([second] if name == best else [])])
+        for one in [one for one in others if one in rows and one != name]:
+            described[name][f"against_{one}"] = against(labels, scores, rows[one], one, draws)
     return {
         "grasps": len(labels.success),
         "objects": len(set(labels.objects)),
         "scenes": labels.num_scenes,
         "success_rate": float(labels.success.mean()),
-        "rows": {
-            name: describe(labels, scores, draws)
-            | {f"against_{one}": against(labels, scores, rows[one], one, draws) for one in others if one != name}
-            for name, scores in rows.items()
-        },
+        "rows": described,
     }

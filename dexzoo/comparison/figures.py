@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from dexzoo.comparison.scores import Labels, Scores
+from dexzoo.comparison.scores import COIN, GM, Labels, Scores
 from dexzoo.metrics import (
     CalibrationError,
     SceneAUROC,
@@ -158,6 +158,12 @@ def against(labels: Labels, scores: Scores, other: Scores, name: str, draws: Arr
         right, other_right = scores.predicted == labels.success, other.predicted == labels.success
         found["accuracy"] = cross_table(right, other_right, name) | gains(right, other_right, labels.scene, draws)
     return found
+
+
+def best_first(rows: dict[str, Any]) -> list[str]:
+    """The names of the rows that are models, those with the highest top-1 first; rows: what `describe` says."""
+    models = [name for name in rows if name not in (GM, COIN)]
+    return sorted(models, key=lambda name: -rows[name]["figures"]["top1"]["value"])
 
 
 def gains(

@@ -12,6 +12,7 @@ from rich import box
 from rich.table import Table
 
 from dexzoo.comparison.charts import draw_charts
+from dexzoo.comparison.figures import best_first
 from dexzoo.comparison.scores import EM2, GM
 
 
@@ -51,6 +52,7 @@ _COST = {
     "threads": "threads",
     "processor": "processor",
 }
+_MILLISECONDS = ("milliseconds_per_view", "milliseconds_per_1000_grasps")
 NOTES = """\
 Accuracy, balanced accuracy (the mean of the rates at which successes and failures are recognised) and success of the
 first and of the five first grasps of each scene in %; AUROC over all grasps and, averaged, within scenes; average
@@ -88,13 +90,42 @@ def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
 
 
 def terminal_table(result: dict[str, Any]) -> Table:
-    """The main table of the first source, the generated grasps, for a terminal of 80 columns."""
+    """The main table of the first source, the generated grasps, and `advice`, for a terminal of 80 columns."""
     source, section = next(iter(result["sources"].items()))
     head, rows = main_table(section, brief=True)
-    shown = Table(*head, title=title(source, section), box=box.SIMPLE)
+    shown = Table(*head, title=title(source, section), box=box.SIMPLE, caption=advice(result), caption_justify="left")
     for row in rows:
         shown.add_row(*(re.sub(r"\*\*(.*?)\*\*", r"[bold]\1[/bold]", cell) for cell in row))
     return shown
+
+
+def advice(result: dict[str, Any]) -> str:
+    """One sentence on the first source: which model to use and why, or how a model alone does against gm.
+
+    It is the model with the highest top-1 or, where its lead over the next may be chance, the quicker of the two. Empty
+    where there is nothing to compare.
+    """
+    rows, cost = next(iter(result["sources"].values()))["rows"], result["cost"]
+    models = best_first(rows)
+    best, other, *_ = [*models, *([GM] if models and GM in rows else []), "", ""]
+    if not other:
+        return ""
+    cross = rows[best][f"against_{other}"]["top1"]
+    lead, sure = 100 * cross["difference"]["value"], cross["p"] < 0.05
+    why = (
+        f"{best}'s first grasp holds in {100 * rows[best]['figures']['top1']['value']:.1f} % of the scenes, "
+        f"{abs(lead):.1f} points {'less' if lead < 0 else 'more'} than {other}'s (only {best}'s in "
+        f"{cross['only_this']:,} scenes, only {other}'s in {cross[f'only_{other}']:,}), which "
+        f"{'is beyond chance' if sure else 'may be chance'} (p {_p(cross)})"
+    )
+    if other == GM:
+        return f"{why}."
+    if sure:
+        return f"Use {best}: {why}."
+    time = {name: sum(cost[name][part] for part in _MILLISECONDS) for name in (best, other)}
+    quick, slow = sorted(time, key=time.__getitem__)
+    spent = f"{time[quick]:,.0f} ms for a view and 1,000 grasps against {time[slow]:,.0f}"
+    return f"Use {quick}: {why}, and {quick} is the quicker, {spent}."
 
 
 def counts_table(section: dict[str, Any]) -> Cells:
@@ -139,8 +170,8 @@ def title(source: str, section: dict[str, Any]) -> str:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The whole comparison: for each source the main table and the counts, then the cost."""
-    parts = [f"# Comparison on the {result['split']} split\n", NOTES]
+    """The whole comparison: `advice`, for each source the main table and the counts, then the cost."""
+    parts = [f"# Comparison on the {result['split']} split\n", f"{advice(result)}\n", NOTES]
     for source, section in result["sources"].items():
         parts += [f"## {title(source, section)}\n", table(*main_table(section)), table(*counts_table(section))]
         parts += against_em2(section)

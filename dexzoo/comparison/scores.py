@@ -7,7 +7,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -84,10 +83,11 @@ class Scores:
 class Cost:
     """What a model takes.
 
-    parameters: those trained; the frozen trunk, shared by models, has its own. megabytes: of its weights as `save`
-    writes them, without the trunk. An ensemble's members count in both. milliseconds_per_view,
-    milliseconds_per_1000_grasps: best of three on `threads` threads; the view is encoded by the trunk and all, the
-    grasps are scored on one view. processor: whose they are, and whether it has instructions for bfloat16.
+    parameters: those trained; the frozen trunk, shared by models, has its own. megabytes: of the file that it was read
+    from, or else that `save` would write, without the trunk. An ensemble's members count in both.
+    milliseconds_per_view, milliseconds_per_1000_grasps: best of three on `threads` threads; the view is encoded by the
+    trunk and all, the grasps are scored on one view. processor: whose they are, and whether it has instructions for
+    bfloat16.
     """
 
     parameters: int
@@ -133,15 +133,16 @@ def encoded_views(model: GraspEvaluator, dataset: GraspDataset) -> Iterator[tupl
 
 @torch.no_grad()
 def model_scores(model: GraspEvaluator, dataset: GraspDataset, title: str) -> Scores:
-    """Log-odds and probabilities of a model on each grasp, seen in the view that the set pairs it with.
+    """Log-odds and probabilities of a model on each grasp, without dropout, in the view that the set pairs it with.
 
     title: of the progress bar. ValueError for a model that gives nan.
     """
     logit = torch.zeros(len(dataset))
     views = encoded_views(model, dataset)
     num_views = len(dataset.view.unique())
-    for rows, scene in track(views, title, num_views, transient=True, disable=not sys.stderr.isatty()):
-        logit[rows] = model.logit(scene, dataset.aimed(rows)[None].to(model.device))[0].float().cpu()
+    with model.without_dropout():
+        for rows, scene in track(views, title, num_views, transient=True, disable=not sys.stderr.isatty()):
+            logit[rows] = model.logit(scene, dataset.aimed(rows)[None].to(model.device))[0].float().cpu()
     if wrong := int((~logit.isfinite()).sum()):
         raise ValueError(f"{title}: {wrong} of {len(logit)} scores are nan or infinite; the weights are of no use")
     return Scores(logit.numpy(), 0.5, model.probability(logit).numpy())
@@ -181,11 +182,12 @@ def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: 
     """Size of a model, and its speed on one view and some grasps, which are repeated up to 1,000."""
     image = image.to(model.device)
     grasps = grasps[torch.arange(NUM_TIMED) % len(grasps)].to(model.device)
-    scene = model.encode(image)
-    view = _best_time(lambda: model.encode(image))
-    scoring = _best_time(lambda: [model.logit(scene, part[None]) for part in grasps.split(CHUNK)])
+    with model.without_dropout():
+        scene = model.encode(image)
+        view = _best_time(lambda: model.encode(image))
+        scoring = _best_time(lambda: [model.logit(scene, part[None]) for part in grasps.split(CHUNK)])
     with tempfile.TemporaryDirectory() as folder:
-        size = sum(part.save(Path(folder)).stat().st_size for part in model.parts)
+        size = sum(part.num_bytes or part.save(folder).stat().st_size for part in model.parts)
     return Cost(
         sum(parameter.numel() for part in model.parts for parameter in part.parameters()),
         round(size / 1e6, 1),

@@ -52,7 +52,7 @@ class EM2(GraspEvaluator):
             for _ in range(count):
                 layers += [nn.Conv1d(channels, size, kernel_size=3, padding=1), nn.ReLU()]
                 channels = size
-        self.hand_branch = nn.Sequential(*layers)
+        self.hand_branch = nn.Sequential(*layers, nn.AdaptiveAvgPool1d(1), nn.Flatten())
         self.head = nn.Sequential(
             *dense(512 + self.image_encoder.channels, width, dropout, depth=2), nn.Linear(width, 2)
         )
@@ -71,7 +71,7 @@ class EM2(GraspEvaluator):
         """Log-odds of success."""
         views, count = grasps.shape[:2]
         vector = self.grasp_vector(grasps).flatten(0, 1)
-        hand = self.hand_branch(vector[:, None]).mean(-1).unflatten(0, (views, count))
+        hand = self.hand_branch(vector[:, None]).unflatten(0, (views, count))
         image = scene["features"].to(hand)[:, None].expand(-1, count, -1)
         fail, success = self.head(torch.cat((image, hand), dim=-1)).unbind(-1)
         log_odds: Tensor = success - fail

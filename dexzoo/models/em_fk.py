@@ -82,7 +82,7 @@ class EMFK(GraspEvaluator):
         self.shape_embedding = nn.Parameter(0.02 * torch.randn(shapes, width))
         self.blocks = nn.ModuleList(Block(width, dropout, attention) for _ in range(num_blocks))
         self.norm = nn.LayerNorm(width)
-        self.query = nn.Linear(width, 1)
+        self.query = nn.Linear(width, 1) if attention else None
         self.head = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Dropout(dropout), nn.Linear(width, 1))
 
     def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
@@ -126,8 +126,8 @@ class EMFK(GraspEvaluator):
         for block in self.blocks:
             x = block(x)
         x = self.norm(x)
-        share = self.query(x).softmax(1) if self.attention else x.new_ones(x.shape[1], 1) / x.shape[1]
-        log_odds: Tensor = self.head((share * x).sum(1)).view(views, count)
+        pooled = x.mean(1) if self.query is None else (self.query(x).softmax(1) * x).sum(1)
+        log_odds: Tensor = self.head(pooled).view(views, count)
         return log_odds
 
     def look(
@@ -196,7 +196,7 @@ class Block(nn.Module):
     def __init__(self, width: int, dropout: float, attention: bool) -> None:
         super().__init__()
         self.attend = nn.MultiheadAttention(width, 4, dropout, batch_first=True) if attention else None
-        self.norms = nn.ModuleList((nn.LayerNorm(width), nn.LayerNorm(width)))
+        self.norms = nn.ModuleList((nn.LayerNorm(width) if attention else nn.Identity(), nn.LayerNorm(width)))
         self.mlp = nn.Sequential(
             nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width), nn.Dropout(dropout)
         )

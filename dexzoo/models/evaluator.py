@@ -104,7 +104,8 @@ class GraspEvaluator(LightningModule):
     temperature: Tensor
     offset: Tensor
     sha256: str | None = None
-    """Of the file that `dexzoo.load` read; None for a model that was made otherwise."""
+    num_bytes: int | None = None
+    """Both of the file that `dexzoo.load` read; None for a model that was made otherwise."""
     frozen_encoder: ClassVar[bool] = False
     """Whether `encode` has nothing to train, so that its result can be kept for the next epoch and on disk."""
 
@@ -303,12 +304,20 @@ class GraspEvaluator(LightningModule):
         checkpoint["random_state"] = torch.get_rng_state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up the random state at the next step, and the best so far, though a resumed run has its own folder."""
+        """Take up the random state at the next step, and the best so far, though a resumed run has its own folder.
+
+        Settings stay as configured: early stopping's patience and, unless a schedule moves them, the optimiser's.
+        """
         self._random_state = checkpoint["random_state"]
         for callback in self.trainer.checkpoint_callbacks:
             state = checkpoint["callbacks"].get(callback.state_key)
             if isinstance(callback, ModelCheckpoint) and state is not None:
                 state["dirpath"] = callback.dirpath  # with another one Lightning forgets the best score
+        for stopping in self.trainer.early_stopping_callbacks:
+            checkpoint["callbacks"].get(stopping.state_key, {})["patience"] = stopping.patience
+        if not checkpoint["lr_schedulers"]:
+            for group in (group for state in checkpoint["optimizer_states"] for group in state["param_groups"]):
+                group |= {"lr": self.learning_rate, "weight_decay": self.weight_decay}
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Set the random state that a checkpoint kept; what came between, such as making loaders, may have drawn."""

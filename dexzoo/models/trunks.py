@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -155,7 +155,7 @@ def trunk_card(name: str) -> dict[str, Any] | None:
     return card
 
 
-@lru_cache(maxsize=2)
+@cache
 def load_trunk(name: str) -> nn.Module:
     """A trunk with its weights, frozen; one copy of each is shared by all models.
 

@@ -6,7 +6,7 @@ import difflib
 import hashlib
 import importlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from dexzoo.models.evaluator import CARD_FORMAT, GraspEvaluator
+from dexzoo.models.evaluator import CARD_FORMAT, GraspEvaluator, TrainingOptions
 from dexzoo.resources import resource
 
 _MODELS = {
@@ -91,11 +91,18 @@ def shipped_card(name: str) -> dict[str, Any] | None:
 def _shipped(name: str) -> Path:
     path = resource("checkpoints") / f"{name}.safetensors"
     if not path.is_file():
-        how = f"train them with `python -m dexzoo fit --config {name}.yaml` and load the run's folder"
-        if name == "ensemble":
-            how = "make one of trained models with Ensemble(members=[...]).save(FOLDER) and load the folder"
-        raise FileNotFoundError(f"model {name} comes without weights; {how}")
+        raise FileNotFoundError(f"model {name} comes without weights; {how_to_get(name)}")
     return path
+
+
+def how_to_get(name: str) -> str:
+    """What to do for weights of a name of `list_models` that comes without."""
+    if name == "ensemble":
+        return "make one of trained models with Ensemble(members=[...]).save(FOLDER) and load the folder"
+    ours = f"{name}-adamw.yaml"
+    config = ours if (resource("configs") / ours).is_file() else f"{name}.yaml"
+    first = "make its trunk by `python assets/checkpoints/train_resnet50.py`, then " if name == "em3" else ""
+    return f"{first}train them with `python -m dexzoo fit --config {config}` and load the run's folder"
 
 
 def _only_weights(folder: Path) -> Path:
@@ -140,8 +147,10 @@ def _read(path: Path) -> GraspEvaluator:
         evaluator = cls(**card["arguments"])
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path.with_suffix('.json')}: {cls.__name__} refuses its arguments: {error}") from None
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{path.with_suffix('.json')} names what is not there: {error}") from None
     load_weights(evaluator, weights, path)
-    evaluator.sha256 = sha256
+    evaluator.sha256, evaluator.num_bytes = sha256, path.stat().st_size
     return evaluator.eval()
 
 
@@ -161,20 +170,36 @@ def _read_card(path: Path) -> dict[str, Any]:
     return card
 
 
-def load_weights(evaluator: GraspEvaluator, weights: dict[str, torch.Tensor], path: str | Path) -> None:
-    """Put weights into an evaluator. ValueError that names the file when they are of another architecture or size."""
+def load_weights(
+    evaluator: GraspEvaluator,
+    weights: Mapping[str, torch.Tensor],
+    path: str | Path,
+    arguments: Mapping[str, Any] | None = None,
+) -> None:
+    """Put weights into an evaluator. ValueError that names the file when they are of another architecture or size.
+
+    arguments: those of the evaluator that the weights come from, where it is of the same class; the error names those
+    that differ.
+    """
     own = evaluator.state_dict()
     uncalibrated = {"temperature": torch.ones(()), "offset": torch.zeros(())}  # as saved before there was calibration
-    weights = uncalibrated | weights
+    weights = uncalibrated | dict(weights)
 
-    def size(tensors: dict[str, torch.Tensor], name: str) -> str:
+    def size(tensors: Mapping[str, torch.Tensor], name: str) -> str:
         return " x ".join(map(str, tensors[name].shape)) if name in tensors else "absent"
 
     odd = [name for name in sorted(set(own) | set(weights)) if size(own, name) != size(weights, name)]
     if odd:
+        asked = evaluator.arguments
+        # rates, shares and scales are floats, and shape nothing
+        differ = [
+            f"{name}, {value} in the file and {asked[name]} as configured"
+            for name, value in (arguments or {}).items()
+            if value != asked[name] and name not in TrainingOptions.__annotations__ and not isinstance(value, float)
+        ]
+        tensors = f"{len(odd)} tensors such as {odd[0]}, {size(weights, odd[0])} in the file and {size(own, odd[0])}"
         raise ValueError(
-            f"{path} holds another architecture than {evaluator.architecture} as configured, by {len(odd)} tensors "
-            f"such as {odd[0]}, {size(weights, odd[0])} in the file and {size(own, odd[0])} as configured; use the "
-            "configuration that it was trained with"
+            f"{path} holds another architecture than {evaluator.architecture} as configured, by "
+            f"{'; '.join(differ) or f'{tensors} as configured'}; use the configuration that it was trained with"
         )
     evaluator.load_state_dict({name: value.to(own[name].dtype) for name, value in weights.items()})
