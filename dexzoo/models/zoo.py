@@ -193,9 +193,9 @@ def load_weights(
         asked = evaluator.arguments
         # rates, shares and scales are floats, and shape nothing
         differ = [
-            f"{name}, {value} in the file and {asked[name]} as configured"
+            f"{name}, {value} in the file and {asked.get(name)} as configured"
             for name, value in (arguments or {}).items()
-            if value != asked[name] and name not in TrainingOptions.__annotations__ and not isinstance(value, float)
+            if value != asked.get(name) and name not in TrainingOptions.__annotations__ and not isinstance(value, float)
         ]
         tensors = f"{len(odd)} tensors such as {odd[0]}, {size(weights, odd[0])} in the file and {size(own, odd[0])}"
         raise ValueError(
