@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from dexzoo.cli import main
+from dexzoo.models.zoo import list_models, shipped_card
 from dexzoo.sim import Scene
 from dexzoo.sim.shapes import make_object
 
@@ -85,6 +86,12 @@ def test_the_cards_say_what_the_weights_and_the_benchmarks_do(monkeypatch: pytes
         assert f"| licence | {licence}, Copyright" in "\n".join(cards["trunk"]({"trunk": name}))
     assert "Frozen trunk" in written["em2"]
     assert "Frozen trunk" not in written["em_fk"]
+
+
+def test_the_comparison_is_of_the_weights_that_ship() -> None:
+    compared = json.loads((ROOT / "benchmarks" / "results" / "comparison.json").read_text())
+    cards = {name: card for name in list_models() if (card := shipped_card(name))}
+    assert compared["weights"] == {name: [card["sha256"]] for name, card in cards.items()}
 
 
 def test_the_figures_are_those_that_the_benchmarks_wrote(monkeypatch: pytest.MonkeyPatch) -> None:
