@@ -15,13 +15,20 @@ RULES = {
 }
 GROUP = "group "
 """How the names of the thesis' groups begin in the benchmark."""
-MESHES = "### On objects from elsewhere\n\n"
+HEADS = {
+    "refinement": "",
+    "refinement_validation": "### With a judge, on validation objects\n\n",
+    "refinement_meshes": "### On objects from elsewhere\n\n",
+}
+"""What stands over each run of the benchmark."""
 
 
 def refinement() -> str:
     """What has been measured of refinement; each part as soon as its benchmark has been run."""
-    parts = {"refinement": whole, "refinement_meshes": lambda found: MESHES + whole(found), "refinement_cost": cost}
-    return "\n".join(write(read(name)) for name, write in parts.items() if (RESULTS / f"{name}.json").exists())
+    parts = [head + whole(read(name)) for name, head in HEADS.items() if (RESULTS / f"{name}.json").exists()]
+    if (RESULTS / "refinement_cost.json").exists():
+        parts.append(cost(read("refinement_cost")))
+    return "\n".join(parts)
 
 
 def whole(found: dict[str, Any]) -> str:
