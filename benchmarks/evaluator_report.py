@@ -3,6 +3,7 @@
 import json
 from typing import Any
 
+from generator_report import share
 from tables import RESULTS, percent, read, span, table
 
 from dexzoo.comparison.compare import GENERATED
@@ -57,16 +58,12 @@ def beside_thesis(section: dict[str, Any]) -> str:
             if "against_gm" in row:
                 here["failures_removed"] = row["against_gm"]["top1"]["failures_removed"]["value"]
             keys = ("accuracy", "top1", "failures_removed")
-            rows.append([name, *(_share(some.get(key)) for key in keys for some in (thesis, here))])
+            rows.append([name, *(share(some.get(key)) for key in keys for some in (thesis, here))])
     head = ("", "accuracy, thesis", "here", "top-1, thesis", "here", "gm's top-1 failures removed, thesis", "here")
     return (
         "Beside the thesis, whose test set has 99,521 grasps in 1,539 scenes, 52.0 % of which hold (its Tables 3.3 and "
         f"3.4), where here {percent(section['success_rate'])} do:\n\n"
     ) + table(head, rows)
-
-
-def _share(value: float | None) -> str:
-    return "" if value is None else percent(value)
 
 
 def of_other_data(found: dict[str, Any]) -> list[str]:

@@ -9,7 +9,6 @@ bootstrap over scenes; OMP_NUM_THREADS bounds the threads. The simulator selects
 """
 
 import argparse
-import inspect
 import json
 import math
 import sys
@@ -153,7 +152,12 @@ def main() -> None:
         "judge": options.judge,
         "digest": {"evaluator": model.digest, "judge": judge.digest if judge else None},
         "others": others,
-        "defaults": {"region": asdict(Region()), "weights": asdict(Weights())} | _defaults("num_steps", "step_size"),
+        "defaults": {
+            "region": asdict(Region()),
+            "weights": asdict(Weights()),
+            "num_steps": method.NUM_STEPS,
+            "step_size": method.STEP_SIZE,
+        },
         "clearance": {"around": AROUND, "middle": MIDDLE, "max_lack": method.MAX_LACK},
         "split": source,
         "num_grasps": options.num_grasps,
@@ -247,11 +251,6 @@ def depth(view: Observation, grasps: Grasps) -> np.ndarray:
         links = grasps.wrist_pose[row, : GRIP + 1, None] @ hand.forward_kinematics(grasps.joints[row, : GRIP + 1])
         deepest.append(float(-hand.signed_distance(links, points).amin().clamp_max(0)))
     return np.array(deepest)
-
-
-def _defaults(*names: str) -> dict[str, Any]:
-    parameters = inspect.signature(dexzoo.refine).parameters
-    return {name: parameters[name].default for name in names}
 
 
 def _numbers(values: torch.Tensor | None, count: int) -> np.ndarray:

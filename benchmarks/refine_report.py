@@ -17,7 +17,7 @@ GROUP = "group "
 """How the names of the thesis' groups begin in the benchmark."""
 HEADS = {
     "refinement": "",
-    "refinement_validation": "### With a judge, on validation objects\n\n",
+    "refinement_validation": "### With a judge (method) and without, on validation objects\n\n",
     "refinement_meshes": "### On objects from elsewhere\n\n",
 }
 """What stands over each run of the benchmark."""

@@ -254,8 +254,8 @@ class Hand(nn.Module):
     ) -> Float[Tensor, "*both solid"]:
         """Distance in metres from each solid link to the closest of the points, negative inside; inf without points.
 
-        The least of `signed_distance` over the points, several times faster where a gradient is wanted: it is taken of
-        the closest points alone.
+        The least of `signed_distance` over the points, in less time where a gradient is wanted: it is taken of the
+        closest points alone.
         """
         if not points.shape[-2]:
             batch = torch.broadcast_shapes(links.shape[:-3], points.shape[:-2])
@@ -284,7 +284,7 @@ class Hand(nn.Module):
     def self_overlap(self, links: Float[Tensor, "*batch link 4 4"]) -> Float[Tensor, "*batch pair"]:
         """Metres that the links of each of `self_pairs` overlap, 0 where they do not: what `self_distance` is below 0.
 
-        Several times faster, since most pairs are too far apart to be looked at.
+        Two to three times as fast, since most pairs are too far apart to be looked at.
         """
         constants = self._cast(links)
         poses = self.shape_poses(links).reshape(-1, len(self.shapes), 4, 4)

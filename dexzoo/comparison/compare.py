@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from dexzoo.comparison.figures import NUM_DRAWS, against, best_first, describe, draw_scenes
+from dexzoo.comparison.figures import NUM_DRAWS, against, by_top1, describe, draw_scenes
 from dexzoo.comparison.scores import (
     COIN,
     EM2,
@@ -93,7 +93,7 @@ def _section(labels: Labels, rows: dict[str, Scores], validation: Labels | None,
     rows = {**rows, **reference, COIN: coin_scores(labels, seed)}
     draws = draw_scenes(labels.num_scenes, seed)
     described = {name: describe(labels, scores, draws) for name, scores in rows.items()}
-    best, second = [*best_first(described), None, None][:2]
+    best, second = [*by_top1(described), None, None][:2]
     for name, scores in rows.items():
         others = dict.fromkeys([GM, EM2, *([second] if name == best else [])])
         for one in [one for one in others if one in rows and one != name]:

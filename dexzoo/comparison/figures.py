@@ -160,7 +160,7 @@ def against(labels: Labels, scores: Scores, other: Scores, name: str, draws: Arr
     return found
 
 
-def best_first(rows: dict[str, Any]) -> list[str]:
+def by_top1(rows: dict[str, Any]) -> list[str]:
     """The names of the rows that are models, those with the highest top-1 first; rows: what `describe` says."""
     models = [name for name in rows if name not in (GM, COIN)]
     return sorted(models, key=lambda name: -rows[name]["figures"]["top1"]["value"])

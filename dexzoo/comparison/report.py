@@ -12,7 +12,7 @@ from rich import box
 from rich.table import Table
 
 from dexzoo.comparison.charts import draw_charts
-from dexzoo.comparison.figures import best_first
+from dexzoo.comparison.figures import by_top1
 from dexzoo.comparison.scores import EM2, GM
 
 
@@ -106,7 +106,7 @@ def advice(result: dict[str, Any]) -> str:
     where there is nothing to compare.
     """
     rows, cost = next(iter(result["sources"].values()))["rows"], result["cost"]
-    models = best_first(rows)
+    models = by_top1(rows)
     best, other, *_ = [*models, *([GM] if models and GM in rows else []), "", ""]
     if not other:
         return ""

@@ -25,7 +25,7 @@ from dexzoo.refinement.optimisers import BY_GRADIENT
 from dexzoo.refinement.penalties import Posed
 from dexzoo.refinement.variables import Region
 
-NUM_STEPS = 30
+NUM_STEPS, STEP_SIZE = 30, 0.2
 MIN_RISE = 1e-4
 """Log-odds by which the objective must rise; less may be rounding."""
 MAX_LACK = 0.001
@@ -70,7 +70,7 @@ def refine(
     margin: float = 0.0,
     optimiser: Literal["adam", "lbfgs", "metropolis", "random"] = "adam",
     num_steps: int = NUM_STEPS,
-    step_size: float = 0.2,
+    step_size: float = STEP_SIZE,
     variables: Literal["grip", "uncoupled", "waypoints"] = "grip",
     region: Region | None = None,
     weights: Weights | None = None,
