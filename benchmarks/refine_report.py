@@ -48,6 +48,8 @@ def whole(found: dict[str, Any]) -> str:
             f"{found['without_grasp']} more scenes it found none. Guided by `{found['evaluator']}`, {judge}. The same "
             f"trials before and after; the simulator selects nothing. Intervals are over scenes{alike}.\n",
             outcomes(variants),
+            "How deep the hand lies in what is seen, and the probability of success by what guides:\n",
+            ways(variants),
             "Where the grasps went (thesis, Tables 4.2 and 4.3):\n",
             table(("variant", *went), [(other, *row["transitions"].values()) for other, row in variants.items()]),
             f"The grasp that each rule ranks first in a scene, by `{name}`, and what became of those chosen (thesis, "
@@ -90,10 +92,10 @@ def heads(names: dict[str, Any]) -> tuple[str, ...]:
 
 
 def outcomes(variants: dict[str, Any]) -> str:
+    """What held before and after."""
     head = (
         "variant", "grasps", "hold before", "hold after", "change", "against the first", "gains for a loss", "replaced",
-        "hit the table before", "after", "penetration before, mm", "after", "change", "mean score before", "after",
-        "score rises for", "no number for", "processor seconds for 100",
+        "hit the table before", "after",
     )  # fmt: skip
     rows = [
         (
@@ -107,6 +109,21 @@ def outcomes(variants: dict[str, Any]) -> str:
             share(row["replaced"]),
             row["collided_before"],
             row["collided_after"],
+        )
+        for name, row in variants.items()
+    ]
+    return table(head, rows)
+
+
+def ways(variants: dict[str, Any]) -> str:
+    """How deep the links lie in what is seen, what the evaluator thinks, and what it costs."""
+    head = (
+        "variant", "penetration before, mm", "after", "change", "mean score before", "after", "score rises for",
+        "no number for", "processor seconds for 100",
+    )  # fmt: skip
+    rows = [
+        (
+            name,
             *(f"{1000 * row[key]:.2f}" for key in ("penetration_before", "penetration_after")),
             millimetres(row["penetration_change"]),
             *(f"{row[key]:.3f}" for key in ("score_before", "score_after")),
