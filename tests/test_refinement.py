@@ -365,6 +365,7 @@ def test_many_grasps_are_refined_in_pieces(
     together = refine(grasps, can_view, Known(nearness), weights=PENALTIES, num_steps=4, keep_trace=True)
     monkeypatch.setattr(climb, "CHUNK", 5)
     sizes: list[int] = []
+    threads = torch.get_num_threads()
     pieces = refine(
         grasps, can_view, Known(nearness), weights=PENALTIES, num_steps=4, keep_trace=True,
         on_step=lambda _, value: sizes.append(len(value)),
@@ -373,7 +374,8 @@ def test_many_grasps_are_refined_in_pieces(
     assert together.trace is not None
     assert pieces.trace is not None
     torch.testing.assert_close(pieces.trace.objective, together.trace.objective, atol=1e-4, rtol=1e-4)
-    assert sizes == [5] * 5 + [5] * 5 + [2] * 5
+    assert sizes == [4] * 15
+    assert torch.get_num_threads() == threads
 
 
 def test_progress_is_told_and_the_whole_way_kept(can_view: Observation, grasps: Grasps) -> None:

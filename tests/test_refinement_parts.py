@@ -279,7 +279,7 @@ def run(name: str, function, num_steps: int, step_size: float = 0.2, moves: Tens
     start = torch.zeros(3, SIZE)
     gradient = name in ("adam", "lbfgs")
     search = Search(lambda s: (function(s), {"log_odds": function(s)}), start, gradient, lambda *_: None)
-    draws = Draws.draw(3, num_steps, SIZE, torch.Generator().manual_seed(0))
+    draws = Draws.draw(num_steps, SIZE, [torch.Generator().manual_seed(seed) for seed in range(3)])
     OPTIMISERS[name](search, torch.ones(SIZE) if moves is None else moves, num_steps, step_size, draws)
     return search
 
@@ -356,7 +356,7 @@ def test_metropolis_hastings_leaves_a_top_that_random_steps_do_not() -> None:
             False,
             lambda s, v, values=values: values.append(s),
         )
-        draws = Draws.draw(3, 50, SIZE, torch.Generator().manual_seed(0))
+        draws = Draws.draw(50, SIZE, [torch.Generator().manual_seed(seed) for seed in range(3)])
         OPTIMISERS[name](search, torch.ones(SIZE), 50, 0.1, draws)
         seen[name] = torch.stack(values).abs().amax()
         assert (search.best == 0).all()

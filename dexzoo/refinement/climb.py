@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from numbers import Integral
+from threading import Lock
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,7 +19,7 @@ from dexzoo.refinement.optimisers import BY_GRADIENT, OPTIMISERS, Draws, Search
 from dexzoo.refinement.variables import VARIABLES, Region, Variables, make_variables
 
 CHUNK = 50
-"""Grasps in work at once; bounds memory, and keeps what lies between layers in cache."""
+"""Grasps in work together; bounds memory, and keeps what lies between layers in cache."""
 OnStep = Callable[[int, Float[Tensor, " grasp"]], None]
 
 
@@ -79,21 +82,36 @@ def climb(
     keep_trace: bool = False,
     on_step: OnStep | None = None,
 ) -> Climb:
-    """Climb from waypoints in the world frame, `CHUNK` grasps at a time."""
-    generator = torch.Generator().manual_seed(seed)
-    parts = [_climb_chunk(objective, part, settings, generator, keep_trace, on_step) for part in waypoints.split(CHUNK)]
-    return _join(parts)
+    """Climb from waypoints in the world frame, at most `CHUNK` grasps together, each of torch's threads its own.
+
+    Threads that share small operators gain little by it.
+    """
+    threads, num_chunks = torch.get_num_threads(), math.ceil(len(waypoints) / CHUNK)
+    seeds = torch.randint(2**62, (len(waypoints),), generator=torch.Generator().manual_seed(seed))
+    workers = min(threads, num_chunks)
+    run = partial(_climb_chunk, objective, settings, keep_trace, None if on_step is None else _one_by_one(on_step))
+    try:
+        with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(threads // workers,)) as pool:
+            return _join(list(pool.map(run, waypoints.chunk(num_chunks), seeds.chunk(num_chunks))))
+    finally:
+        torch.set_num_threads(threads)  # for threads that are yet to come, which would take after the pool's
+
+
+def _one_by_one(on_step: OnStep) -> OnStep:
+    lock = Lock()
+
+    def told(step: int, value: Tensor) -> None:
+        with lock:
+            on_step(step, value)
+
+    return told
 
 
 def _climb_chunk(
-    objective: Objective,
-    given: Tensor,
-    settings: Settings,
-    generator: torch.Generator,
-    keep_trace: bool,
-    on_step: OnStep | None,
+    objective: Objective, settings: Settings, keep_trace: bool, on_step: OnStep | None, given: Tensor, seeds: Tensor
 ) -> Climb:
     moved = make_variables(settings.variables, given, objective.hand, settings.region)
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds.tolist()]
     states: list[Tensor] = []
     values: list[Tensor] = []
 
@@ -118,7 +136,7 @@ def _climb_chunk(
             terms_near = objective.near(moved(best))
         evaluate = partial(_evaluate, objective, terms_near, moved)
         search = Search(evaluate, best, settings.optimiser in BY_GRADIENT, told)
-        draws = Draws.draw(CHUNK, num_steps, len(moves), generator).first(len(given))
+        draws = Draws.draw(num_steps, len(moves), generators)
         OPTIMISERS[settings.optimiser](search, moves, num_steps, settings.step_size, draws)
         best, failed, after = search.best, failed | search.failed, search.terms
     rise = objective.value(after) - value

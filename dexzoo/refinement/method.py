@@ -92,7 +92,7 @@ def refine(
     variables: what is moved, see `dexzoo.refinement.variables`. region: how far. weights: what counts how much.
     density: `KopickiGenerator.density` of the view, where it is at hand; it is made if the prior has a weight.
     seed: of the random optimisers. keep_trace: whether all states are handed back. on_step: called with the step, from
-    0, and the objective of the grasps in work, 50 at a time.
+    0, and the objective of the grasps in work, at most 50 at a time, in one thread or another but never in two at once.
     Raises ValueError in one line for arguments that do not fit together, an evaluator without gradients, a judge that
     guides, grasps that cannot be in the frame that they say, and joints outside their limits.
     """
@@ -115,7 +115,8 @@ def refine(
     if weights.prior and density is None:
         density = default_generator().density(observation)
     objective = Objective(view, observation, default_hand(), weights, density)
-    found = climb(objective, world, settings, seed, keep_trace, on_step)
+    with model.without_dropout():
+        found = climb(objective, world, settings, seed, keep_trace, on_step)
 
     accepted = found.rise > MIN_RISE  # never of NaN
     accepted &= objective.lacks(found.waypoints) < objective.lacks(world) + MAX_LACK

@@ -7,7 +7,7 @@ share of the box that a step moves a number by. Random ones take their draws as 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -32,14 +32,10 @@ class Draws(NamedTuple):
     chance: Tensor
 
     @classmethod
-    def draw(cls, num_grasps: int, num_steps: int, size: int, generator: torch.Generator) -> Draws:
-        """Draws of that many grasps."""
-        noise = torch.randn(num_grasps, num_steps, size, generator=generator)
-        return cls(noise, torch.rand(num_grasps, num_steps, generator=generator))
-
-    def first(self, num: int) -> Draws:
-        """Those of the first so many grasps."""
-        return Draws(self.noise[:num], self.chance[:num])
+    def draw(cls, num_steps: int, size: int, generators: Sequence[torch.Generator]) -> Draws:
+        """Draws of as many grasps as there are generators, each from its own, whatever its company."""
+        noise = torch.stack([torch.randn(num_steps, size, generator=generator) for generator in generators])
+        return cls(noise, torch.stack([torch.rand(num_steps, generator=generator) for generator in generators]))
 
 
 class Search:
