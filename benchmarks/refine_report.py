@@ -17,6 +17,7 @@ GROUP = "group "
 """How the names of the thesis' groups begin in the benchmark."""
 HEADS = {
     "refinement": "",
+    "refinement_ablation": "### What each term is worth, and other weights as guides\n\n",
     "refinement_validation": "### With a judge (method) and without, on validation objects\n\n",
     "refinement_meshes": "### On objects from elsewhere\n\n",
 }
