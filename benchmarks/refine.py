@@ -86,6 +86,8 @@ def variants(
     if judge is not None:
         known["no judge"] = by_refine(model, None)
     for label, other in others.items():
+        if label in known:
+            raise ValueError(f"--others: the name {label!r} is taken; use another")
         known[label] = by_refine(other, judge)
         known |= {f"group {group} by {label}": by_thesis(other, group) for group in thesis.GROUPS}
     if tries:
@@ -122,8 +124,8 @@ def main() -> None:
     judge = dexzoo.load(options.judge) if options.judge else None
     if unnamed := [other for other in options.others if "=" not in other]:
         parser.error(f"--others takes NAME=MODEL, got {', '.join(unnamed)}")
-    others = dict(other.split("=", 1) for other in options.others)
-    known = variants(model, judge, {name: dexzoo.load(other) for name, other in others.items()}, options.tries)
+    others = {name: dexzoo.load(other) for name, other in (one.split("=", 1) for one in options.others)}
+    known = variants(model, judge, others, options.tries)
     names = options.variants or list(known)
     if unknown := set(names) - set(known):
         parser.error(f"variants {', '.join(sorted(unknown))} are unknown; use some of {', '.join(known)}")
@@ -151,7 +153,7 @@ def main() -> None:
         "evaluator": options.evaluator,
         "judge": options.judge,
         "digest": {"evaluator": model.digest, "judge": judge.digest if judge else None},
-        "others": others,
+        "others": {name: other.digest for name, other in others.items()},
         "defaults": {
             "region": asdict(Region()),
             "weights": asdict(Weights()),

@@ -17,7 +17,7 @@ import numpy as np
 
 from dexzoo.comparison.compare import GENERATED, load_models
 from dexzoo.comparison.figures import draw_scenes, figures_with_intervals
-from dexzoo.comparison.scores import Scores, model_scores, read_labels, rows_of
+from dexzoo.comparison.scores import Scores, model_scores, read_labels
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
 
@@ -47,7 +47,7 @@ def foreseen(models: list[str], data: GraspDataModule, split: str) -> dict[str, 
     if labels is None:
         raise ValueError(f"grasp set {data.folder} has no generated grasps in its {split} split")
     grasp_set = data.source
-    rate = grasp_set.grasps["success_rate"].to_numpy()[rows_of(data, split, GENERATED)]
+    rate = grasp_set.grasps["success_rate"].to_numpy()[data.rows(split, [GENERATED]).numpy()]
     if np.isnan(rate).any():
         raise ValueError(f"grasp set {data.folder} has grasps that were tried once; collect it with --trials 5")
     trials = int(grasp_set.scenes["trials"][0].as_py())

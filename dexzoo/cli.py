@@ -116,7 +116,10 @@ def _parser() -> tuple[ArgumentParser, dict[str, ArgumentParser]]:
     def add_observation(command: ArgumentParser) -> None:
         command.add_argument("--depth", type=Path, required=True, help="16-bit PNG, or .npy in metres")
         command.add_argument(
-            "--camera", type=Path, required=True, help="JSON: width, height, fx, fy, cx, cy, depth_scale, table_plane"
+            "--camera",
+            type=Path,
+            required=True,
+            help="JSON: width, height, fx, fy, cx, cy, depth_scale; where known table_plane or T_world_camera",
         )
         command.add_argument("--evaluator", default="em_fk", help="name, file, folder or hf:// address of the model")
 

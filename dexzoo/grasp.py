@@ -9,7 +9,8 @@
 - A grasp is 10 waypoints x 28 numbers: wrist position 0:3, wrist quaternion 3:7, joints 7:27, grasp type 27 (an
   index 0...9, the same in all ten). Waypoint 0 is the pre-grasp, waypoint 6 the grip, waypoint 9 the squeeze.
   Waypoints are equally spaced on each leg of the path: positions and joints linear, orientation slerp.
-- Grasps are stored in the world frame; evaluators get them in the camera frame.
+- Grasp sets hold grasps in the world frame; `generate` and `plan` give them in the camera frame, and a file says which
+  it is. `score` and `refine` take either; an architecture's `logit` gets them in the frame of the aimed camera.
 """
 
 from __future__ import annotations

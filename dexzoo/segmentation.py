@@ -13,6 +13,8 @@ MAX_DEPTH = 1.4
 MIN_HEIGHT = 0.008
 """Points lower than this above the table, in metres, are taken as table."""
 MAX_HEIGHT = 0.45
+ON_TABLE, MIN_TABLE = 0.02, 0.1
+"""At least such a share of the readings must lie within so many metres of the table: else it is where nothing is."""
 MIN_POINTS = 50
 """Fewest object points that anything can be inferred from (Kopicki's generator asks as many)."""
 
@@ -51,10 +53,16 @@ def segment(cloud: NDArray[np.floating[Any]], height: NDArray[np.floating[Any]])
 
     cloud: (height, width, 3) each pixel's point in the camera frame, 0 where there is no reading.
     height: (height, width) metres over the table.
-    Raises ValueError when nothing of at least 50 pixels stands on the table.
+    Raises ValueError when hardly a reading lies on the table, or nothing of at least 50 pixels stands on it.
     """
     depth = cloud[..., 2]
-    above = (depth > 0) & (depth < MAX_DEPTH) & (height > MIN_HEIGHT) & (height < MAX_HEIGHT)
+    read = (depth > 0) & (depth < MAX_DEPTH)
+    if read.any() and (np.abs(height[read]) < ON_TABLE).mean() < MIN_TABLE:
+        raise ValueError(
+            "hardly a reading lies on the table; T_world_camera must be of a world whose table top is z = 0, "
+            "table_plane in the camera frame; without them the table is fitted, or give the object's mask"
+        )
+    above = read & (height > MIN_HEIGHT) & (height < MAX_HEIGHT)
     # closing lets a component reach over a line of lost readings
     closed = cv2.morphologyEx(above.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     count, labels, stats, centres = cv2.connectedComponentsWithStats(closed, connectivity=8)

@@ -394,6 +394,16 @@ def test_no_object_above_the_table() -> None:
             _ = observation.points
 
 
+def test_a_pose_whose_table_is_not_in_the_image() -> None:
+    """A robot's base as the world, say: the table is then not at z = 0."""
+    for above in (-0.1, 0.7):
+        raised = T_WORLD_CAMERA.copy()
+        raised[2, 3] += above
+        observation = Observation(render(T_WORLD_CAMERA)[0], CAMERA, raised)
+        with pytest.raises(ValueError, match="hardly a reading lies on the table; T_world_camera must be of a world"):
+            _ = observation.points
+
+
 def test_no_table() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match=r"no table plane is seen; give table_plane or T_world_camera"):

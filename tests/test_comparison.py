@@ -172,6 +172,11 @@ def test_scores_that_are_no_numbers_are_refused(data: GraspDataModule) -> None:
         compare({"broken": Closure(float("nan"))}, data)
 
 
+def test_fewer_scenes_are_compared_alike(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
+    data.num_scenes = 2
+    assert compare(models, data)["sources"]["generated"]["scenes"] == 2
+
+
 def test_a_split_without_generated_grasps_is_refused(data: GraspDataModule) -> None:
     with pytest.raises(ValueError, match="no generated grasps in its train split"):
         compare({}, data, "train")

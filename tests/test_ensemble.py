@@ -95,6 +95,16 @@ def test_a_saved_ensemble_is_a_list_of_members(
     torch.testing.assert_close(again.score(view, grasps), ensemble.score(view, grasps))
 
 
+def test_the_digest_is_that_of_all_weights(members: list[str]) -> None:
+    digests = {Ensemble(members=names).digest for names in (members, members[:2], members[1:2], members[:1])}
+    assert len(digests) == 4
+    assert Ensemble(members=members).digest in digests
+    calibrated = Ensemble(members=members)
+    calibrated.offset.fill_(0.1)
+    assert calibrated.digest not in digests
+    EMFK(width=16, num_blocks=1).bfloat16().digest  # has one  # noqa: B018
+
+
 def test_members_that_are_not_there_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"weights .*gone\.safetensors do not exist"):
         Ensemble(members=[str(tmp_path / "gone.safetensors")])

@@ -173,9 +173,11 @@ def test_a_round_of_other_settings_or_of_a_set_that_grew_is_not_continued(
     assert made["region"]["wrist"] == Region().wrist
     assert made["weights"]["table"] == Weights().table
     assert made["num_steps"] == 30
+    assert made["step_size"] == 0.2
     assert made["clearance"] == {"table": 0.002, "around": 0.007, "lack": 0.001}
     for name, value, told in (
         ("NUM_STEPS", 20, "'num_steps': 30"),
+        ("STEP_SIZE", 0.1, "'step_size': 0.2"),
         ("AROUND", 0.005, "'clearance': {"),
         ("training_scenes", lambda folder: [0, 1, SLICE_SCENES], "'num_scenes': 2"),
     ):

@@ -57,8 +57,9 @@ NOTES = """\
 Accuracy, balanced accuracy (the mean of the rates at which successes and failures are recognised) and success of the
 first and of the five first grasps of each scene in %; AUROC over all grasps and, averaged, within scenes; average
 precision; Brier score and expected calibration error, the lower the better. 95 % intervals are bootstrap over scenes,
-several of which show one object; over objects they would be somewhat wider. p: McNemar's exact test of top-1 against
-gm, the generator's own order, whose threshold was chosen on validation. The best of each column is bold.
+several of which show one object; over objects they would be somewhat wider, and p larger. p: McNemar's exact test of
+top-1 against gm, the generator's own order, whose threshold, where it has one, was chosen on validation. The best of
+each column is bold.
 """
 AGAINST_EM2 = """\
 What each gains over em2 on the same grasps: points of accuracy and of top-1, and how many % of em2's failures in top-1

@@ -98,14 +98,9 @@ class Cost:
     processor: str
 
 
-def rows_of(data: GraspDataModule, split: str, source: str) -> NDArray[np.int64]:
-    """The rows of the table of grasps that a split has from one source, in the order of `data.dataset`."""
-    return np.flatnonzero((data.source.grasp_split == SPLITS.index(split)) & (data.source.source == source))
-
-
 def read_labels(data: GraspDataModule, split: str, source: str) -> Labels | None:
     """The grasps of a split from one source, in the order of `data.dataset`; None where there are none."""
-    grasp_set, rows = data.source, rows_of(data, split, source)
+    grasp_set, rows = data.source, data.rows(split, [source]).numpy()
     if not len(rows):
         return None
     shown, scene = np.unique(grasp_set.grasp_scene[rows], return_inverse=True)

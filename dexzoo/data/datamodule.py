@@ -305,17 +305,22 @@ class GraspDataModule(LightningDataModule):
             )
         return model
 
-    def _rows(self, split: str, sources: list[str]) -> Tensor:
+    def rows(self, split: str, sources: list[str]) -> Tensor:
+        """Rows (n,) of the table of grasps that a split has from these sources, in the order of `dataset`."""
         chosen = (self.source.grasp_split == SPLITS.index(split)) & np.isin(self.source.source, sources)
         rows = np.flatnonzero(chosen)
-        if not len(rows):
-            what = f"no {' or '.join(sources)} grasps in its {split} split"
-            raise ValueError(f"grasp set {self.folder} has {what}; collect more objects")
         scene = self.source.grasp_scene[rows]
         scenes = np.unique(scene)[: self.num_scenes]
         if split == "train":
             scenes = scenes[: max(1, round(self.train_share * len(scenes)))]
         return torch.from_numpy(rows[np.isin(scene, scenes)])
+
+    def _rows(self, split: str, sources: list[str]) -> Tensor:
+        rows = self.rows(split, sources)
+        if not len(rows):
+            what = f"no {' or '.join(sources)} grasps in its {split} split"
+            raise ValueError(f"grasp set {self.folder} has {what}; collect more objects")
+        return rows
 
     def _encode(self, rows: list[int], model: GraspEvaluator) -> Scene:
         """The encoded views of some rows of the table of views, float16, from the cache where it has them."""

@@ -27,7 +27,7 @@ from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
 from dexzoo.refinement import Region, Weights, refine
-from dexzoo.refinement.method import MAX_LACK, NUM_STEPS
+from dexzoo.refinement.method import MAX_LACK, NUM_STEPS, STEP_SIZE
 from dexzoo.refinement.penalties import AROUND
 from dexzoo.sim import Outcomes, trial
 
@@ -70,6 +70,7 @@ class Refining:
             "region": asdict(Region()),
             "weights": asdict(Weights()),
             "num_steps": NUM_STEPS,
+            "step_size": STEP_SIZE,
             "clearance": {"table": MIN_CLEARANCE, "around": AROUND, "lack": MAX_LACK},
         }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import ClassVar, Unpack
 
 import torch
@@ -35,6 +36,12 @@ class Ensemble(GraspEvaluator):
     def parts(self) -> tuple[GraspEvaluator, ...]:
         """Itself and its members; those of a member that is an ensemble too."""
         return (self, *(part for member in self._loaded for part in member.parts))
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its own calibration and the members' weights."""
+        every = [super().digest, *(member.digest for member in self._loaded)]
+        return hashlib.sha256("".join(every).encode()).hexdigest()
 
     def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
         """What each member keeps, under its number."""

@@ -334,8 +334,8 @@ class GraspEvaluator(LightningModule):
     @property
     def digest(self) -> str:
         """SHA-256 of the weights and statistics, by which an evaluator is told from another training of it."""
-        values = (value.cpu().contiguous().numpy().tobytes() for value in self.state_dict().values())
-        return hashlib.sha256(b"".join(values)).hexdigest()
+        values = (value.cpu().contiguous().flatten().view(torch.uint8) for value in self.state_dict().values())
+        return hashlib.sha256(b"".join(value.numpy().tobytes() for value in values)).hexdigest()
 
     def save(self, path: str | Path, *, half: bool = True, card: Mapping[str, Any] | None = None) -> Path:
         """Write weights and card; returns the path of the weights.

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from numbers import Integral
-from threading import Lock
+from threading import Barrier, Lock
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,7 +19,7 @@ from dexzoo.refinement.optimisers import BY_GRADIENT, OPTIMISERS, Draws, Search
 from dexzoo.refinement.variables import VARIABLES, Region, Variables, make_variables
 
 CHUNK = 50
-"""Grasps in work together; bounds memory, and keeps what lies between layers in cache."""
+"""Grasps in work together; bounds each thread's memory, and keeps what lies between layers in cache."""
 OnStep = Callable[[int, Float[Tensor, " grasp"]], None]
 
 
@@ -82,19 +82,25 @@ def climb(
     keep_trace: bool = False,
     on_step: OnStep | None = None,
 ) -> Climb:
-    """Climb from waypoints in the world frame, at most `CHUNK` grasps together, each of torch's threads its own.
+    """Climb from waypoints in the world frame, at most `CHUNK` grasps together.
 
-    Threads that share small operators gain little by it.
+    Each of torch's threads takes chunks of its own: threads that share small operators gain little by it.
     """
     threads, num_chunks = torch.get_num_threads(), math.ceil(len(waypoints) / CHUNK)
     seeds = torch.randint(2**62, (len(waypoints),), generator=torch.Generator().manual_seed(seed))
     workers = min(threads, num_chunks)
     run = partial(_climb_chunk, objective, settings, keep_trace, None if on_step is None else _one_by_one(on_step))
-    try:
-        with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(threads // workers,)) as pool:
-            return _join(list(pool.map(run, waypoints.chunk(num_chunks), seeds.chunk(num_chunks))))
-    finally:
-        torch.set_num_threads(threads)  # for threads that are yet to come, which would take after the pool's
+    started = Barrier(workers + 1)
+
+    def start() -> None:
+        torch.set_num_threads(threads // workers)
+        started.wait()
+
+    with ThreadPoolExecutor(workers, initializer=start) as pool:
+        parts = pool.map(run, waypoints.chunk(num_chunks), seeds.chunk(num_chunks))
+        started.wait()
+        torch.set_num_threads(threads)  # for threads to come, which would take after the pool's
+        return _join(list(parts))
 
 
 def _one_by_one(on_step: OnStep) -> OnStep:

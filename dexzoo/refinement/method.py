@@ -83,16 +83,17 @@ def refine(
 
     grasps: in the frame of the depth image's camera, or of its world. depth: (height, width) metres with its camera, or
     an Observation. evaluator: what guides: a model, or what `dexzoo.load` takes.
-    judge: another such, which does not guide, but must find the log-odds of a refined grasp higher by more than
-    `margin` for it to be accepted. With or without one, the objective must rise, and, where the table has a weight, the
-    whole way to the grip must lack at most a millimetre more of its clearance than before.
+    judge: another such, which does not guide, but must find the log-odds of a refined grasp, before calibration, higher
+    by more than `margin` for it to be accepted. With or without one, the objective must rise, and, where the table has
+    a weight, the whole way to the grip must lack at most a millimetre more of its clearance than before.
     optimiser, num_steps, step_size: how many states are evaluated besides the first of each half; a step moves a number
     by about `step_size` of its half of the trust region. The first half of the steps moves the wrist, the second the
     fingers.
     variables: what is moved, see `dexzoo.refinement.variables`. region: how far. weights: what counts how much.
     density: `KopickiGenerator.density` of the view, where it is at hand; it is made if the prior has a weight.
     seed: of the random optimisers. keep_trace: whether all states are handed back. on_step: called with the step, from
-    0, and the objective of the grasps in work, at most 50 at a time, in one thread or another but never in two at once.
+    0, and the objective of some 50 of the grasps, such parts in no order, from one thread or another but never from two
+    at once; whose it is tells the trace.
     Raises ValueError in one line for arguments that do not fit together, an evaluator without gradients, a judge that
     guides, grasps that cannot be in the frame that they say, and joints outside their limits.
     """
@@ -170,7 +171,7 @@ def checked_in_world(grasps: Grasps, observation: Observation) -> Float[Tensor, 
     """Waypoints in the world frame, float32. ValueError for joints beyond their limits or hands far from the object."""
     hand = default_hand()
     hand.check(grasps.joints)
-    world = grasps.to_frame("world", observation.T_world_camera).waypoints.detach().float()
+    world = grasps.to_frame("world", observation.T_world_camera).waypoints.detach().float().cpu()
     points = torch.from_numpy(observation.points_world[:: len(observation.points_world) // 500 + 1].copy())
     far = torch.cat([Posed(hand, part, (GRIP,)).closest(points).amin((-1, -2)) for part in world.split(CHUNK)])
     if len(far) and far.max() > MAX_DISTANCE:

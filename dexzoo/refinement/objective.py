@@ -24,7 +24,7 @@ Terms = dict[str, Float[Tensor, " grasp"]]
 
 @dataclass(frozen=True)
 class Weights:
-    """Log-odds that a unit of each term counts; 0 leaves a term out, which then costs no time.
+    """Log-odds, as the evaluator gives them before calibration, that a unit of each term counts; 0 leaves a term out.
 
     spread: standard deviation of log-odds among an ensemble's members. prior: the generator's log-density of the grip.
     penetration, shadow: metres of observed points, and of what hides behind them, in the links. table: metres that
