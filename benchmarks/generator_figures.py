@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -43,8 +44,24 @@ class Kept:
         return {number: cls.load(path) for number, path in paths.items() if path.exists()}
 
 
+class Tried(Kept):
+    """Grasps that were tried. outcome: (n, 4) bool, columns FLAGS."""
+
+    outcome: np.ndarray
+
+    @property
+    def success(self) -> np.ndarray:
+        """Which hold, (n,)."""
+        return self.outcome[:, FLAGS.index("success")]
+
+    @property
+    def collided(self) -> np.ndarray:
+        """Which hit the table or what stands on it, (n,)."""
+        return self.outcome[:, FLAGS.index("collided")]
+
+
 @dataclass(frozen=True)
-class Trials(Kept):
+class Trials(Tried):
     """What became of one variant's grasps in one scene, best first.
 
     grip: (n, 28) waypoints at the grip in the world frame. outcome: (n, 4) bool, columns FLAGS.
@@ -63,35 +80,39 @@ class Trials(Kept):
     def __len__(self) -> int:
         return len(self.grip)
 
-    @property
-    def success(self) -> np.ndarray:
-        """Which hold, (n,)."""
-        return self.outcome[:, FLAGS.index("success")]
+
+Counts = tuple[np.ndarray, np.ndarray]
+"""Of each scene, how many hold and of how many."""
 
 
 def compared(done: dict[str, dict[int, Trials]]) -> dict[str, dict[str, Any]]:
-    """The figures of each variant, and on the scenes that it shares with the first one by how much it differs."""
+    """The figures of each variant, and by how much it differs from the first one."""
+    return beside_first(done, lambda scenes: summarise(list(scenes.values())), {"success": share, "top1": top1})
+
+
+def beside_first(
+    done: dict[str, dict[int, Any]],
+    figures: Callable[[dict[int, Any]], dict[str, Any]],
+    counts: dict[str, Callable[[list[Any]], Counts]],
+) -> dict[str, dict[str, Any]]:
+    """The figures of each variant, and on the scenes that it shares with the first one by how much counts differ."""
     base_name, base = next(iter(done.items()))
     result = {}
     for name, scenes in done.items():
         if not scenes:
             sys.stderr.write(f"{name}: nothing is done yet\n")
             continue
-        result[name] = summarise(list(scenes.values()))
+        result[name] = figures(scenes)
         shared = sorted(scenes.keys() & base.keys())
         if name != base_name and shared:
             here, there = ([rows[number] for number in shared] for rows in (scenes, base))
-            change = {key: change_of(of(here), of(there)) for key, of in (("success", share), ("top1", top1))}
+            change = {key: change_of(of(here), of(there)) for key, of in counts.items()}
             result[name]["against"] = {"variant": base_name, "scenes": len(shared), **change}
     return result
 
 
-Counts = tuple[np.ndarray, np.ndarray]
-"""Of each scene, how many hold and of how many."""
-
-
-def share(rows: list[Trials]) -> Counts:
-    return np.array([row.success.sum() for row in rows]), np.array([len(row) for row in rows])
+def share(rows: Sequence[Tried]) -> Counts:
+    return np.array([row.success.sum() for row in rows]), np.array([len(row.success) for row in rows])
 
 
 def top(num: int, rows: list[Trials]) -> Counts:

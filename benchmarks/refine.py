@@ -23,7 +23,8 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from generator import Setting, set_scene
-from refine_figures import FLAGS, Given, Refined, compared
+from generator_figures import FLAGS
+from refine_figures import Given, Refined, compared
 
 import dexzoo
 from dexzoo import Grasps, Observation

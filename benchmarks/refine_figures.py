@@ -1,12 +1,11 @@
 """What benchmarks/refine.py keeps of each scene, and the figures that it makes of that."""
 
-import sys
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from generator_figures import FLAGS, Counts, Kept, change_of, mean, rate, resampled
+from generator_figures import Counts, Tried, beside_first, change_of, mean, rate, resampled, share
 
 from dexzoo.refinement import RANKINGS, rank
 
@@ -15,7 +14,7 @@ GENERATOR = "generator"
 
 
 @dataclass(frozen=True)
-class Given(Kept):
+class Given(Tried):
     """The generator's grasps of a scene, best first, and what became of them.
 
     waypoints: (n, 10, 28) in the world frame. outcome: (n, 4) bool, columns FLAGS. penetration: (n,) metres.
@@ -30,14 +29,9 @@ class Given(Kept):
     def __len__(self) -> int:
         return len(self.waypoints)
 
-    @property
-    def success(self) -> np.ndarray:
-        """Which hold, (n,)."""
-        return self.outcome[:, FLAGS.index("success")]
-
 
 @dataclass(frozen=True)
-class Refined(Kept):
+class Refined(Tried):
     """What one variant made of them, all (n,) but outcome (n, 4); the judge's scores are NaN where there was none.
 
     cost: (2,) seconds of wall and of processor time.
@@ -52,16 +46,6 @@ class Refined(Kept):
     outcome: np.ndarray
     penetration: np.ndarray
     cost: np.ndarray
-
-    @property
-    def success(self) -> np.ndarray:
-        """Which hold, (n,)."""
-        return self.outcome[:, FLAGS.index("success")]
-
-    @property
-    def collided(self) -> np.ndarray:
-        """Which hit the table or what stands on it, (n,)."""
-        return self.outcome[:, FLAGS.index("collided")]
 
     def first(self, rule: str) -> int:
         """The row that a rule ranks first."""
@@ -90,30 +74,18 @@ class Scores(NamedTuple):
 
 def compared(given: dict[int, Given], done: dict[str, dict[int, Refined]]) -> dict[str, dict[str, Any]]:
     """The figures of each variant, and on the scenes that it shares with the first one by how much it differs."""
-    base_name, base = next(iter(done.items()))
-    result = {}
-    for name, rows in done.items():
-        if not rows:
-            sys.stderr.write(f"{name}: nothing is done yet\n")
-            continue
-        result[name] = summarise([given[number] for number in rows], list(rows.values()))
-        shared = sorted(rows.keys() & base.keys())
-        if name != base_name and shared:
-            here, there = ([some[number] for number in shared] for some in (rows, base))
-            change = change_of(held(here), held(there))
-            result[name]["against"] = {"variant": base_name, "scenes": len(shared), "success": change}
-    return result
 
+    def figures(rows: dict[int, Refined]) -> dict[str, Any]:
+        return summarise([given[number] for number in rows], list(rows.values()))
 
-def held(rows: list[Any]) -> Counts:
-    return np.array([row.success.sum() for row in rows]), np.array([len(row.success) for row in rows])
+    return beside_first(done, figures, {"success": share})
 
 
 def summarise(given: list[Given], rows: list[Refined]) -> dict[str, Any]:
-    before, after = held(given), held(rows)
+    before, after = share(given), share(rows)
     was, now = (np.concatenate([row.success for row in some]) for some in (given, rows))
     hit = np.concatenate([row.collided for row in rows])
-    was_hit = np.concatenate([row.outcome[:, FLAGS.index("collided")] for row in given])
+    was_hit = np.concatenate([row.collided for row in given])
     fell, rose = int((was & ~now).sum()), int((~was & now).sum())
     deep, then = (np.concatenate([row.penetration for row in some]) for some in (given, rows))
     cost = np.array([row.cost for row in rows])
