@@ -30,7 +30,8 @@ def main() -> None:
 def summary() -> str:
     generated = read("comparison")["sources"]["generated"]
     best, gm = (generated["rows"][name]["figures"] for name in ("em_fk", "gm"))
-    method = read("refinement")["variants"]["method"]
+    refined = read("refinement")["variants"]
+    method, ascent = refined["method"], refined["group A"]
     meshes = read("refinement_meshes")["variants"]["method"]
     first = method["top1"]["before"]
 
@@ -52,6 +53,7 @@ def summary() -> str:
         ),
         ("the same grasps refined", rate(method["success_after"])),
         ("change", points(method["change"])),
+        ("change by the thesis' ascent (its group A)", points(ascent["change"])),
         ("the first of each scene in the order of `em_fk`, as generated", rate(first["unrefined"])),
         ("the same, refined", rate(first["refined"])),
         (
