@@ -59,8 +59,7 @@ def beside_thesis(section: dict[str, Any]) -> str:
                 here["failures_removed"] = row["against_gm"]["top1"]["failures_removed"]["value"]
             keys = ("accuracy", "top1", "failures_removed")
             rows.append([name, *(share(some.get(key)) for key in keys for some in (thesis, here))])
-            if (card := resource("checkpoints") / f"{name}.json").exists():
-                run = json.loads(card.read_text())
+            if run := card(name):
                 grasps = run["config"]["trainer"]["max_epochs"] * run["data"]["train_grasps"]
                 seen.append(f"`{name}` {grasps:,} by a recipe of ours")
     head = ("", "accuracy, thesis", "here", "top-1, thesis", "here", "gm's top-1 failures removed, thesis", "here")
@@ -71,12 +70,17 @@ def beside_thesis(section: dict[str, Any]) -> str:
     ) + table(head, rows)
 
 
+def card(name: str) -> dict[str, Any]:
+    """The card of a model that comes with weights; empty where none does."""
+    path = resource("checkpoints") / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
 def of_other_data(found: dict[str, Any]) -> list[str]:
     """What has to be known of models that have learnt from another grasp set than the one compared on."""
     told = []
     for name in found["weights"]:
-        path = resource("checkpoints") / f"{name}.json"
-        data = json.loads(path.read_text())["data"] if path.exists() else {}
+        data = card(name).get("data", {})
         if data and data.get("sha256") != found["data"]["sha256"]:
             told.append(f"`{name}` has learnt from {data['train_grasps']:,} grasps of another, earlier set.\n")
     return told

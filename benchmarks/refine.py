@@ -86,19 +86,22 @@ def variants(
     }
     if judge is not None:
         known["no judge"] = by_refine(model, None)
+
+    def add(source: str, name: str, variant: Variant) -> None:
+        if name in known:
+            raise ValueError(f"{source}: the name {name!r} is taken; use another")
+        known[name] = variant
+
     for label, other in others.items():
-        if label in known:
-            raise ValueError(f"--others: the name {label!r} is taken; use another")
-        known[label] = by_refine(other, judge)
-        known |= {f"group {group} by {label}": by_thesis(other, group) for group in thesis.GROUPS}
+        add("--others", label, by_refine(other, judge))
+        for group in thesis.GROUPS:
+            add("--others", f"group {group} by {label}", by_thesis(other, group))
     if tries:
         for name, arguments in json.loads(tries.read_text()).items():
-            if name in known:
-                raise ValueError(f"{tries}: the name {name!r} is taken; use another")
             for key, kind in (("region", Region), ("weights", Weights)):
                 if key in arguments:
                     arguments[key] = kind(**arguments[key])
-            known[name] = by(**arguments)
+            add(str(tries), name, by(**arguments))
     return known
 
 
