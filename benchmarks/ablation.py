@@ -4,7 +4,7 @@ python benchmarks/ablation.py --list
 python benchmarks/ablation.py --runs em_fk em_fk-image --folder runs/ablation     # any of them, in any order, anywhere
 python benchmarks/ablation.py --done --out benchmarks/results/ablation.json       # sum up the runs that are finished
 Each run has a folder of its own: a finished run is not repeated, one that was killed goes on from its last checkpoint.
-All see as many grasps, `--grasps`, in batches of their configurations' size, whatever data they have; twenty times on
+All see as many grasps, `--grasps`, in batches of their configurations' size, whatever data they have; ten times on
 the way the averaged weights are validated, and the best are kept. The test objects choose nothing. Intervals are 95 %
 bootstrap over scenes, also of the difference from the run that a row is compared with.
 """
@@ -31,7 +31,7 @@ from dexzoo.data.schema import SOURCES
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.resources import resource
 
-NUM_VALIDATIONS = 20
+NUM_VALIDATIONS = 10
 REFINED = "refined"
 Replicates = NDArray[np.float64]
 FIGURES = ("accuracy", "auroc", "scene_auroc", "average_precision", "calibration_error", "top1", "top5")

@@ -14,7 +14,6 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ from dexzoo.grasp import GRIP
 from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.refinement import Refinement, Region, Weights, method, thesis
-from dexzoo.refinement.penalties import AROUND, MIDDLE
 from dexzoo.sim import Scene, trial
 
 METHOD = "method"
@@ -129,7 +127,10 @@ def main() -> None:
     if unnamed := [other for other in options.others if "=" not in other]:
         parser.error(f"--others takes NAME=MODEL, got {', '.join(unnamed)}")
     others = {name: dexzoo.load(other) for name, other in (one.split("=", 1) for one in options.others)}
-    known = variants(model, judge, others, options.tries)
+    try:
+        known = variants(model, judge, others, options.tries)
+    except ValueError as error:
+        parser.error(str(error))
     names = options.variants or list(known)
     if unknown := set(names) - set(known):
         parser.error(f"variants {', '.join(sorted(unknown))} are unknown; use some of {', '.join(known)}")
@@ -158,13 +159,7 @@ def main() -> None:
         "judge": options.judge,
         "digest": {"evaluator": model.digest, "judge": judge.digest if judge else None},
         "others": {name: other.digest for name, other in others.items()},
-        "defaults": {
-            "region": asdict(Region()),
-            "weights": asdict(Weights()),
-            "num_steps": method.NUM_STEPS,
-            "step_size": method.STEP_SIZE,
-        },
-        "clearance": {"around": AROUND, "middle": MIDDLE, "max_lack": method.MAX_LACK},
+        "defaults": method.default_settings(),
         "split": source,
         "num_grasps": options.num_grasps,
         "without_grasp": sum(not len(row) for row in given.values()),

@@ -10,11 +10,13 @@ from safetensors.torch import load_file
 
 from dexzoo.camera import Observation, look_at
 from dexzoo.comparison import scores
+from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.grasp import Grasps
 from dexzoo.models import zoo
 from dexzoo.models.em_fk import EMFK
 from dexzoo.models.ensemble import Ensemble
 from dexzoo.models.ffh import FFH
+from dexzoo.training import calibrate
 
 CENTRE = np.array([0.0, 0, 0.04])
 
@@ -93,6 +95,23 @@ def test_a_saved_ensemble_is_a_list_of_members(
     again = zoo.load(tmp_path)
     assert again.arguments["members"] == members
     torch.testing.assert_close(again.score(view, grasps), ensemble.score(view, grasps))
+
+
+def test_it_is_calibrated_on_validation_scenes(members: list[str], tmp_path: Path) -> None:
+    data = GraspDataModule(str(synthetic.write(tmp_path / "grasps", num_grasps=40)), cache=str(tmp_path / "cache"))
+    ensemble = Ensemble(members=members[:2])
+    dataset = data.dataset("validation", ensemble)
+
+    def loss() -> float:
+        with torch.no_grad():
+            probability = ensemble.probability(ensemble.batch_logit(dataset[list(range(len(dataset)))]))
+        return float(torch.nn.functional.binary_cross_entropy(probability, dataset.success))
+
+    before = loss()
+    calibrate(ensemble, data)
+    assert loss() < before
+    mean = ensemble.probability(ensemble.batch_logit(dataset[list(range(len(dataset)))])).mean()
+    torch.testing.assert_close(mean, dataset.success.mean(), atol=1e-3, rtol=0)  # where the likelihood is greatest
 
 
 def test_the_digest_is_that_of_all_weights(members: list[str]) -> None:

@@ -22,7 +22,7 @@ from dexzoo.generators.kopicki import KopickiGenerator
 from dexzoo.grasp import GRIP, Grasps
 from dexzoo.hand import default_hand
 from dexzoo.models.em_fk import EMFK
-from dexzoo.refinement import Region, Weights
+from dexzoo.refinement import Region, Weights, method
 from dexzoo.sim import Outcomes, Scene, trial
 
 NUM = 8
@@ -174,15 +174,15 @@ def test_a_round_of_other_settings_or_of_a_set_that_grew_is_not_continued(
     assert made["weights"]["table"] == Weights().table
     assert made["num_steps"] == 30
     assert made["step_size"] == 0.2
-    assert made["clearance"] == {"table": 0.002, "around": 0.007, "lack": 0.001}
-    for name, value, told in (
-        ("NUM_STEPS", 20, "'num_steps': 30"),
-        ("STEP_SIZE", 0.1, "'step_size': 0.2"),
-        ("AROUND", 0.005, "'clearance': {"),
-        ("training_scenes", lambda folder: [0, 1, SLICE_SCENES], "'num_scenes': 2"),
+    assert made["clearance"] == {"table": 0.002, "around": 0.007, "middle": 0.35, "lack": 0.001}
+    for module, name, value, told in (
+        (method, "NUM_STEPS", 20, "'num_steps': 30"),
+        (method, "STEP_SIZE", 0.1, "'step_size': 0.2"),
+        (method, "AROUND", 0.005, "'clearance': {"),
+        (refined, "training_scenes", lambda folder: [0, 1, SLICE_SCENES], "'num_scenes': 2"),
     ):
         with monkeypatch.context() as patch:
-            patch.setattr(refined, name, value)
+            patch.setattr(module, name, value)
             message = rf"refined1 of grasp set .* was made with {{{told}.*; start another --round"
             with pytest.raises(ValueError, match=message):
                 next(iter(collect_refined(folder, how)))

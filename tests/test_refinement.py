@@ -17,6 +17,7 @@ from dexzoo.hand import Hand
 from dexzoo.models.em_fk import EMFK
 from dexzoo.models.ensemble import Ensemble
 from dexzoo.models.evaluator import GraspEvaluator, Scene
+from dexzoo.models.zoo import load
 from dexzoo.refinement import OPTIMISERS, RANKINGS, Refinement, Region, Weights, climb, method, rank, refine
 from dexzoo.refinement.penalties import Posed
 from dexzoo.refinement.thesis import GROUPS, HALF_CUBE, ascend
@@ -575,8 +576,11 @@ def test_a_judge_that_guides_is_refused(grasps: Grasps, can_view: Observation, t
         str(EMFK(width=16, num_blocks=1, image=False).save(tmp_path / f"{i}.safetensors")) for i in range(3)
     )
     some = Ensemble(members=[first, second])
-    guided = Known(nearness)
-    for evaluator, judge in ((guided, guided), (first, first), (some, second), (first, some)):
+    guided, recalibrated = Known(nearness), load(first)
+    recalibrated.temperature.fill_(2.0)
+    for evaluator, judge in (
+        (guided, guided), (first, first), (first, recalibrated), (some, second), (first, some)
+    ):  # fmt: skip
         with pytest.raises(ValueError, match="the judge is, or shares a member with, what guides"):
             refine(grasps, can_view, evaluator, judge=judge)
     refine(grasps[:2], can_view, some, judge=Ensemble(members=[third]), weights=NOTHING, num_steps=2)

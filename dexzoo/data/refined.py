@@ -7,7 +7,7 @@ of the grasps that it liked best is what it has to learn next.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,11 @@ from dexzoo.data.schema import SCHEMAS, decode_path, encode_path
 from dexzoo.data.workers import in_processes
 from dexzoo.data.writer import GraspSetWriter, grasp_rows
 from dexzoo.generators import default_generator
-from dexzoo.generators.generator import MIN_CLEARANCE
 from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
-from dexzoo.refinement import Region, Weights, refine
-from dexzoo.refinement.method import MAX_LACK, NUM_STEPS, STEP_SIZE
-from dexzoo.refinement.penalties import AROUND
+from dexzoo.refinement import refine
+from dexzoo.refinement.method import default_settings
 from dexzoo.sim import Outcomes, trial
 
 SLICE_SCENES = 20
@@ -67,11 +65,7 @@ class Refining:
             "seed": self.seed,
             "num_grasps": self.num_grasps,
             "num_scenes": num_scenes,
-            "region": asdict(Region()),
-            "weights": asdict(Weights()),
-            "num_steps": NUM_STEPS,
-            "step_size": STEP_SIZE,
-            "clearance": {"table": MIN_CLEARANCE, "around": AROUND, "lack": MAX_LACK},
+            **default_settings(),
         }
 
 

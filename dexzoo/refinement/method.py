@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from dexzoo.camera import Camera, Observation
 from dexzoo.generators import default_generator
 from dexzoo.generators.density import GraspDensity
+from dexzoo.generators.generator import MIN_CLEARANCE
 from dexzoo.grasp import GRIP, Grasps, transform_waypoints
 from dexzoo.hand import default_hand
 from dexzoo.models.evaluator import GraspEvaluator, PreparedView
@@ -22,7 +23,7 @@ from dexzoo.models.zoo import load
 from dexzoo.refinement.climb import CHUNK, OnStep, Settings, Trace, climb
 from dexzoo.refinement.objective import Objective, Terms, Weights
 from dexzoo.refinement.optimisers import BY_GRADIENT
-from dexzoo.refinement.penalties import Posed
+from dexzoo.refinement.penalties import AROUND, MIDDLE, Posed
 from dexzoo.refinement.variables import Region
 
 NUM_STEPS, STEP_SIZE = 30, 0.2
@@ -34,6 +35,17 @@ MAX_DISTANCE = 0.1
 """Metres between hand and object at the grip beyond which nothing is grasped: the grasps are in another frame than they
 say. The 35,000 grasps of 150 scenes that were looked at, in two views each, stay below 0.04; in the wrong frame, with
 the camera 0.4 m away, nine in ten are beyond."""
+
+
+def default_settings() -> dict[str, Any]:
+    """What a refinement depends on besides its inputs where no argument is given, as plain values for a record."""
+    return {
+        "region": asdict(Region()),
+        "weights": asdict(Weights()),
+        "num_steps": NUM_STEPS,
+        "step_size": STEP_SIZE,
+        "clearance": {"table": MIN_CLEARANCE, "around": AROUND, "middle": MIDDLE, "lack": MAX_LACK},
+    }
 
 
 @dataclass(frozen=True)
@@ -148,12 +160,16 @@ def refine(
 
 def check_judge(evaluator: GraspEvaluator, judge: GraspEvaluator) -> None:
     """ValueError for a judge that is the evaluator which guides, or shares a trained member with it."""
-    guiding, judging = (
-        {part.digest for part in model.parts if next(part.parameters(), None) is not None}  # an ensemble has none
-        for model in (evaluator, judge)
-    )
-    if judge is evaluator or guiding & judging:
+    if judge is evaluator or any(_same_weights(a, b) for a in evaluator.parts for b in judge.parts):
         raise ValueError("the judge is, or shares a member with, what guides, and cannot but agree; give another one")
+
+
+def _same_weights(a: GraspEvaluator, b: GraspEvaluator) -> bool:
+    """Whether all that was trained is the same, whatever the calibration; nothing was in an ensemble itself."""
+    mine, theirs = dict(a.named_parameters()), dict(b.named_parameters())
+    return (
+        bool(mine) and mine.keys() == theirs.keys() and all(torch.equal(mine[k].cpu(), theirs[k].cpu()) for k in mine)
+    )
 
 
 def as_observation(depth: NDArray[np.floating] | Observation, camera: Camera | None) -> Observation:
