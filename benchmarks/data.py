@@ -67,7 +67,7 @@ def count(data: GraspSet, manifest: dict) -> dict[str, object]:
     def share(chosen: np.ndarray) -> dict[str, float]:
         return {"grasps": int(chosen.sum()), "hold": float(data.success[chosen].mean())}
 
-    every = np.ones_like(generated)
+    every, splits = np.ones_like(generated), np.array(SPLITS)[data.grasp_split]
     ranks = {
         f"{low + 1} to {high}" if high > low + 1 else str(high): generated & (low <= rank) & (rank < high)
         for low, high in pairwise(RANKS)
@@ -90,8 +90,8 @@ def count(data: GraspSet, manifest: dict) -> dict[str, object]:
         "unstable": int(np.sum(data.grasps["unstable"].to_numpy())),
         "duplicates": len(data.paths) - len(np.unique(data.paths, axis=0)),
         "outside_limits": outside_limits(data),
-        "by_split": by(np.array(SPLITS)[data.grasp_split], every),
-        "by_source": by(data.source, every),
+        "by_split": by(splits, every),
+        "by_source": by(np.char.add(np.char.add(data.source.astype(str), ", "), splits), every),
         "by_category": by(category, generated),
         "by_type": by(kind, generated),
         "by_rank": {name: share(chosen) for name, chosen in ranks.items() if chosen.any()},

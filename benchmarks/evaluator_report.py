@@ -34,7 +34,14 @@ def evaluators() -> str:
 
 def comparison(found: dict[str, Any]) -> str:
     """The comparison's own tables, and its charts."""
-    parts = ["## Evaluators\n", f"`benchmarks/comparison.py`. {NOTES}", *of_other_data(found)]
+    chosen_on = read("data")["by_source"][f"{GENERATED}, validation"]
+    parts = [
+        "## Evaluators\n",
+        f"`benchmarks/comparison.py`. {NOTES}",
+        f"Probabilities were calibrated on {chosen_on['grasps']:,} {GENERATED} grasps of the validation objects, "
+        f"{percent(chosen_on['hold'])} of which hold.\n",
+        *of_other_data(found),
+    ]
     for source, section in found["sources"].items():
         parts += [f"{title(source, section)}:\n", table(*main_table(section))]
         if source == GENERATED:

@@ -80,7 +80,13 @@ def counts() -> str:
         f"Scenes tried and left out: {skipped(data['skipped'])}. With theirs, {percent(data['hold_of_all_generated'])} "
         "of all generated grasps hold.\n",
     ]
-    names = {"split": "split", "source": "source", "category": "category", "type": "type", "rank": "place in the order"}
+    names = {
+        "split": "split",
+        "source": "source and split",
+        "category": "category",
+        "type": "type",
+        "rank": "place in the order",
+    }
     for name, head in names.items():
         rows = [(value, f"{row['grasps']:,}", percent(row["hold"])) for value, row in data[f"by_{name}"].items()]
         lines.append(table((head, "grasps" if name in ("split", "source") else "generated grasps", "hold"), rows))
