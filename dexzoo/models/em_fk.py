@@ -257,4 +257,11 @@ def nearest(p: Tensor, n: Tensor, seen: Float[Tensor, "view cloud 6"]) -> Tensor
 def nearest_rows(p: Float[Tensor, "point 3"], cloud: Float[Tensor, "cloud 3"]) -> Tensor:
     """(point,) rows of the nearest in a cloud that lies about the origin, part by part."""
     half = -0.5 * cloud.square().sum(1)
-    return torch.cat([torch.addmm(half, part, cloud.mT).argmax(1) for part in p.split(_PART)])
+    return torch.cat([_argmax(torch.addmm(half, part, cloud.mT)) for part in p.split(_PART)])
+
+
+def _argmax(values: Float[Tensor, "row column"]) -> Tensor:
+    """(row,) places of the greatest; on a processor by NumPy, which is eight times as fast at it as torch."""
+    if values.device.type != "cpu":
+        return values.argmax(1)
+    return torch.from_numpy(values.numpy().argmax(1))
