@@ -153,8 +153,8 @@ def cost(found: dict[str, Any]) -> str:
             f"100 grasps x {found['num_steps']} steps take {whole['seconds']:.1f} s and at most "
             f"{whole['peak_megabytes']:.0f} MB with all that is loaded; the evaluator alone takes "
             f"{alone['seconds']:.1f} s. The density behind the prior is made once for a view, in "
-            f"{density['seconds']:.1f} s. Processor seconds that each term adds, as the difference of two runs, to the evaluator's "
-            f"{alone['processor_seconds']:.1f}:\n",
+            f"{density['seconds']:.1f} s. Processor seconds that each term adds, as the difference of two runs, to the "
+            f"evaluator's {alone['processor_seconds']:.1f}:\n",
             table(tuple(name.replace("_", " ") for name in terms), [tuple(f"{value:.2f}" for value in terms.values())]),
             f"In {found['few_steps']} steps:\n",
             table(("grasps", "seconds", "processor seconds", "MB at most"), rows),
