@@ -75,14 +75,16 @@ def variants(
         "Metropolis-Hastings": by(optimiser="metropolis"),
         "random search": by(optimiser="random"),
         "no prior": by(weights=Weights(prior=0.0)),
-        "no penetration": by(weights=Weights(penetration=0.0, shadow=0.0)),
-        "no table": by(weights=Weights(table=0.0)),
+        "no penetration or shadow": by(weights=Weights(penetration=0.0, shadow=0.0)),
+        "no table, nor its test": by(weights=Weights(table=0.0)),
         "no self-collision": by(weights=Weights(self_collision=0.0)),
         "no coupling": by(variables="uncoupled"),
         "no acceptance": whatever_rises(by_refine(model, None)),
         "280 free numbers": by(variables="waypoints"),
     }
-    if judge is not None:
+    if judge is None:
+        known["judge ffh"] = by_refine(model, dexzoo.load("ffh"))
+    else:
         known["no judge"] = by_refine(model, None)
 
     def add(source: str, name: str, variant: Variant) -> None:
