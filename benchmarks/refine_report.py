@@ -36,8 +36,8 @@ def whole(found: dict[str, Any]) -> str:
     """The tables of one run of the benchmark."""
     variants = found["variants"]
     name, first = next(iter(variants.items()))
-    judge = "accepted where the objective rises and the way keeps its clearance"
-    judge += f", if `{found['judge']}` agrees" if found["judge"] else ""
+    judge = f", and if `{found['judge']}` agrees" if found["judge"] else ""
+    none = f"; in {found['without_grasp']} more scenes it found none" if found["without_grasp"] else ""
     several = first["scenes"] > first["objects"]
     alike = "; several are of one object, so that for objects they are somewhat too narrow" if several else ""
     went = heads(first["transitions"])
@@ -45,11 +45,15 @@ def whole(found: dict[str, Any]) -> str:
     return "\n".join(
         [
             f"`benchmarks/refine.py`; {first['scenes']} scenes of {first['objects']} objects ({found['split']}), at "
-            f"most {found['num_grasps']} grasps of the Kopicki generator each, {first['grasps']:,} in all; in "
-            f"{found['without_grasp']} more scenes it found none. Guided by `{found['evaluator']}`, {judge}. The same "
-            f"trials before and after; the simulator selects nothing. Intervals are over scenes{alike}.\n",
+            f"most {found['num_grasps']} grasps of the Kopicki generator each, {first['grasps']:,} in all{none}. "
+            f"`{name}` is guided by `{found['evaluator']}`, and replaces a grasp where the objective rises and the way "
+            f"keeps its clearance{judge}; so do the others but for what their names say, and the thesis' groups, which "
+            "replace all. The same trials before and after; the simulator selects nothing. Intervals are over "
+            f"scenes{alike}. \"against the first\" compares with the first row; \"gains for a loss\" are failures that "
+            "come to hold for each success that is lost.\n",
             outcomes(variants),
-            "How deep the hand lies in what is seen, and the probability of success by what guides:\n",
+            "How deep at most any link lies in what is seen, up to the grip, and the probability of success by what "
+            "guides; \"failed\" are grasps whose objective was no number; 30 steps on one thread:\n",
             ways(variants),
             "Where the grasps went (thesis, Tables 4.2 and 4.3):\n",
             table(("variant", *went), [(other, *row["transitions"].values()) for other, row in variants.items()]),
@@ -102,7 +106,7 @@ def outcomes(variants: dict[str, Any]) -> str:
         (
             name,
             f"{row['grasps']:,}",
-            share(row["success_before"]["rate"]),
+            rate(row["success_before"]),
             rate(row["success_after"]),
             points(row["change"]),
             points(row["against"]["success"]) if "against" in row else "",
@@ -120,7 +124,7 @@ def ways(variants: dict[str, Any]) -> str:
     """How deep the links lie in what is seen, what the evaluator thinks, and what it costs."""
     head = (
         "variant", "penetration before, mm", "after", "change", "mean score before", "after", "score rises for",
-        "no number for", "processor seconds for 100",
+        "failed", "processor seconds for 100",
     )  # fmt: skip
     rows = [
         (

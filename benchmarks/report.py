@@ -56,6 +56,7 @@ def summary() -> str:
         ("change by the thesis' ascent (its group A)", points(ascent["change"])),
         ("the first of each scene in the order of `em_fk`, as generated", rate(first["unrefined"])),
         ("the same, refined", rate(first["refined"])),
+        ("change", points(first["change"])),
         (
             "grasps that would hit the table or a block, as generated and refined",
             f"{method['collided_before']} and {method['collided_after']}",

@@ -129,7 +129,9 @@ def _refine(options: Namespace) -> Result:
             seed=options.seed,
             on_step=lambda _, value: bar.advance(task, len(value)),
         )
-    if options.picture is not None and len(grasps):
+    if options.picture is not None and not len(grasps):
+        _err.print(f"there are no grasps, so {options.picture} is not drawn", soft_wrap=True)
+    elif options.picture is not None:
         best = int(rank(result)[0])
         plots.save(_before_and_after(observation, grasps[best], result.grasps[best]), options.picture)
     if options.out is not None:

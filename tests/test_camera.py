@@ -13,6 +13,7 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+import dexzoo
 from dexzoo import rotation
 from dexzoo.camera import Camera, Observation, colourise
 from dexzoo.segmentation import fit_table
@@ -478,3 +479,14 @@ def test_real_frames(name: str, fitted: bool, tmp_path: Path) -> None:
     assert np.rad2deg(np.arccos(min(observation.table[:3] @ plane["normal"], 1))) < 0.5
     assert observation.table[3] == pytest.approx(plane["offset"], abs=0.003)
     assert observation.aimed().mask.sum() > 1000
+
+
+@pytest.mark.skipif(FRAMES is None, reason="DEXZOO_REAL_FRAMES names no folder of NAME_depth.png, .json")
+@pytest.mark.parametrize("name", ["blue_mug", "green_bowl", "mustard"])
+def test_grasps_on_real_frames_are_refined(name: str) -> None:
+    observation = Observation.load(Path(str(FRAMES)) / f"{name}_depth.png", Path(str(FRAMES)) / f"{name}.json")
+    given = dexzoo.generate(observation, num_grasps=4, seed=0)
+    result = dexzoo.refine(given, observation, num_steps=4)
+    assert torch.isfinite(result.grasps.waypoints).all()
+    assert result.accepted.any()
+    assert result.score_after.mean() > result.score_before.mean()

@@ -262,6 +262,19 @@ def test_a_sentence_says_which_to_use(
     assert advice(summary(top1, held, p)) == before + after
 
 
+@pytest.mark.parametrize(
+    ("value", "p", "doubted"), [(0.5, 0.01, False), (0.5, 0.07, True), (0.95, 1e-6, True)], ids=["more", "same", "less"]
+)
+def test_the_sentence_doubts_what_is_not_surely_better_than_the_generator(
+    value: float, p: float, doubted: bool
+) -> None:
+    result = summary({"a": 0.9, "b": 0.8, "gm": value}, (40, 12), 0.0003)
+    rows = result["sources"]["generated"]["rows"]
+    rows["a"]["against_gm"] = {"top1": {"p": p, "difference": {"value": 0.9 - value}}}
+    doubt = " That a's order is better than gm's, the generator's own, may be chance (p "
+    assert (doubt in advice(result)) == doubted
+
+
 def test_the_best_is_set_against_the_next(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
     result = compare({"wrong": models["wrong"], "right": models["right"]}, data)
     rows = result["sources"]["generated"]["rows"]

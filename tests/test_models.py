@@ -311,6 +311,16 @@ def test_every_configuration_runs(config: str, arguments: list[str]) -> None:
     training.main(["fit", "--config", config, *arguments, "--trainer.fast_dev_run", "1"])
 
 
+@pytest.mark.parametrize("name", ["em1", "em2"])
+def test_the_recipe_of_the_thesis_is_kept(name: str) -> None:
+    config = yaml.safe_load((resource("configs") / f"{name}.yaml").read_text())
+    section = {"optimizer": "sgd", "learning_rate": 0.001, "average_decay": 0.999, "dropout": 0.5, "gain": 1.0}
+    assert config["model"]["init_args"].items() >= section.items()
+    assert config["model"]["init_args"]["weight_decay"] == 0
+    assert config["data"] == {"folder": "assets/grasps", "batch_size": 64, "sources": ["generated"]}
+    assert config["trainer"]["max_steps"] == 300_000
+
+
 def test_fit_writes_a_run_that_load_and_the_other_commands_take(
     here: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,7 +1,7 @@
 """Refinement on evaluators whose best grasp is known: what rises, what is accepted, and what stays."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -330,6 +330,8 @@ def test_no_grasps(can_view: Observation, judge: Known | None) -> None:
     assert result.grasps.frame == "camera"
     assert result.accepted.shape == result.score_after.shape == result.failed.shape == (0,)
     assert (result.judge_after is None) == (judge is None)
+    assert set(result.penalties) == set(asdict(Weights()))
+    assert all(value.shape == (0,) for value in result.penalties.values())
     assert len(rank(result)) == 0
     assert result.trace is None
     trace = refine(none, can_view, Known(nearness), num_steps=3, keep_trace=True).trace

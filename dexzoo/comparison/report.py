@@ -121,12 +121,16 @@ def advice(result: dict[str, Any]) -> str:
     )
     if other == GM:
         return f"{why}."
+    alone = rows[best].get("against_gm", {}).get("top1")
+    doubt = ""
+    if alone and not (alone["p"] < 0.05 and alone["difference"]["value"] > 0):
+        doubt = f" That {best}'s order is better than gm's, the generator's own, may be chance (p {_p(alone)})."
     if sure:
-        return f"Use {best}: {why}."
+        return f"Use {best}: {why}.{doubt}"
     time = {name: sum(cost[name][part] for part in _MILLISECONDS) for name in (best, other)}
     quick, slow = sorted(time, key=time.__getitem__)
     spent = f"{time[quick]:,.0f} ms for a view and 1,000 grasps against {time[slow]:,.0f}"
-    return f"Use {quick}: {why}, and {quick} is the quicker, {spent}."
+    return f"Use {quick}: {why}, and {quick} is the quicker, {spent}.{doubt}"
 
 
 def counts_table(section: dict[str, Any]) -> Cells:

@@ -113,7 +113,7 @@ def initialise(module: nn.Module, gain: float = 1.0) -> None:
     A ReLU halves the variance: with gain 1 thirteen layers leave a hundredth of their input, with the root of 2 all.
     """
     for layer in module.modules():
-        if isinstance(layer, (nn.Linear, nn.Conv1d, nn.Conv2d)):
+        if isinstance(layer, (nn.Linear, nn.Conv1d)):
             nn.init.xavier_uniform_(layer.weight, gain)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)

@@ -23,7 +23,7 @@ from dexzoo.models.zoo import load
 from dexzoo.refinement.climb import CHUNK, OnStep, Settings, Trace, climb
 from dexzoo.refinement.objective import Objective, Terms, Weights
 from dexzoo.refinement.optimisers import BY_GRADIENT
-from dexzoo.refinement.penalties import AROUND, MIDDLE, Posed
+from dexzoo.refinement.penalties import AROUND, MIDDLE, SHADOW_DEPTHS, Posed
 from dexzoo.refinement.variables import Region
 
 NUM_STEPS, STEP_SIZE = 30, 0.2
@@ -38,13 +38,14 @@ the camera 0.4 m away, nine in ten are beyond."""
 
 
 def default_settings() -> dict[str, Any]:
-    """What a refinement depends on besides its inputs where no argument is given, as plain values for a record."""
+    """What is set where no argument is given, and the lengths that terms and acceptance go by: for a record."""
     return {
         "region": asdict(Region()),
         "weights": asdict(Weights()),
         "num_steps": NUM_STEPS,
         "step_size": STEP_SIZE,
         "clearance": {"table": MIN_CLEARANCE, "around": AROUND, "middle": MIDDLE, "lack": MAX_LACK},
+        "shadow": list(SHADOW_DEPTHS),
     }
 
 
@@ -121,7 +122,7 @@ def refine(
         check_judge(model, second)
     if not len(grasps):
         trace = Trace(torch.zeros(num_steps + 1, 0, 10, 28), torch.zeros(num_steps + 1, 0)) if keep_trace else None
-        return _of_none(grasps, second is not None, trace)
+        return _of_none(grasps, weights, second is not None, trace)
     view = model.prepare(observation)
     if optimiser in BY_GRADIENT:
         check_gradient(view, world[:1])
@@ -235,7 +236,8 @@ def _trace_in_frame(trace: Trace, grasps: Grasps, observation: Observation) -> T
     return Trace(waypoints, trace.objective)
 
 
-def _of_none(grasps: Grasps, judged: bool, trace: Trace | None) -> Refinement:
+def _of_none(grasps: Grasps, weights: Weights, judged: bool, trace: Trace | None) -> Refinement:
     value, flag = torch.zeros(0), torch.zeros(0, dtype=torch.bool)
     opinion: tuple[Tensor | None, Tensor | None] = (value, value) if judged else (None, None)
-    return Refinement(grasps, value, value, flag, flag, {}, *opinion, trace)
+    penalties = {name: value for name, weight in asdict(weights).items() if weight}
+    return Refinement(grasps, value, value, flag, flag, penalties, *opinion, trace)
