@@ -77,6 +77,7 @@ def training(card: dict[str, Any]) -> str:
     settings = {f"{part}, {name}": value for part, own in card.get("config", {}).items() for name, value in own.items()}
     rows = [
         ("grasps", f"{data['train_grasps']:,}"),
+        ("grasps seen", f"{card['grasps_seen']:,}, each time that one was drawn counted"),
         ("grasp set", f"format {data['version']}, SHA-256 of its tables `{data['sha256']}`"),
         ("command", f"`{card['command']}`"),
         ("seed", card["seed"]),

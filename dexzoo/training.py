@@ -106,6 +106,7 @@ class CommandLine(LightningCLI):
         metrics = self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)[0]
         card = {
             "data": self.datamodule.describe(),
+            "grasps_seen": self.trainer.global_step * self.trainer.accumulate_grad_batches * self.datamodule.batch_size,
             "metrics": {name: round(value, 4) for name, value in metrics.items()},
             "config": self._settings(),
             "seed": self._get(self.config, "seed_everything"),

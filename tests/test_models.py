@@ -333,6 +333,7 @@ def test_fit_writes_a_run_that_load_and_the_other_commands_take(
     assert card["arguments"]["width"] == 64
     assert card["command"].startswith("python -m dexzoo fit --config=smoke.yaml")
     assert card["data"]["train_grasps"] == 160
+    assert card["grasps_seen"] == 3 * 32
     assert card["config"]["data"]["batch_size"] == 32
     assert card["config"]["trainer"]["max_steps"] == 3
     assert "logger" not in card["config"]["trainer"]
