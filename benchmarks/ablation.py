@@ -54,7 +54,7 @@ def runs() -> dict[str, Run]:
     base = {"data.sources": [source for source in SOURCES if source != REFINED]}
     whole = {"em_fk": "em_fk.yaml", "em2": "em2-adamw.yaml", "em1": "em1-adamw.yaml"}
     known = {name: Run(config, base) for name, config in whole.items()}
-    for part in ("image", "depth", "cloud", "table", "attention"):
+    for part in ("image", "depth", "cloud", "table", "way", "attention"):
         known[f"em_fk-{part}"] = Run("em_fk.yaml", base | {f"model.{part}": False}, "em_fk")
     known["em_fk-perturbed"] = Run("em_fk.yaml", {"data.sources": SOURCES[:1]}, "em_fk")
     for share in (10, 30):

@@ -43,8 +43,9 @@ class EMFK(GraspEvaluator):
     encoded once for each view, shows at its projection. A primitive's points at all stages make its token; attention
     among tokens, and from one query to all, makes one logit. All of it is differentiable in the grasp.
 
-    image, depth, cloud, table: whether these ingredients enter. attention: whether tokens attend to each other and are
-    pooled by attention, or each goes alone and the mean is taken.
+    image, depth, cloud, table: whether these ingredients enter. way: whether the hand is looked at at all four
+    waypoints, or at the grip alone. attention: whether tokens attend to each other and are pooled by attention, or each
+    goes alone and the mean is taken.
     width: of the tokens. num_blocks: rounds of attention. dropout: probability of dropping a unit.
     The other arguments are `GraspEvaluator`'s.
     """
@@ -62,14 +63,17 @@ class EMFK(GraspEvaluator):
         depth: bool = True,
         cloud: bool = True,
         table: bool = True,
+        way: bool = True,
         attention: bool = True,
         **training: Unpack[TrainingOptions],
     ) -> None:
         super().__init__(**training)
         self.width, self.num_blocks, self.dropout = width, num_blocks, dropout
-        self.image, self.depth, self.cloud, self.table, self.attention = image, depth, cloud, table, attention
+        self.image, self.depth, self.cloud, self.table = image, depth, cloud, table
+        self.way, self.attention = way, attention
+        self.stages = STAGES if way else [GRIP]
         self.register_buffer("points", torch.stack(surface_points(default_hand(), NUM_POINTS)), persistent=False)
-        shapes, stages = self.points.shape[1], len(STAGES)
+        shapes, stages = self.points.shape[1], len(self.stages)
         if image:
             self.pyramid = Pyramid(FEATURES["image"])
             self.context = nn.Linear(self.pyramid.context_size, width)
@@ -135,7 +139,7 @@ class EMFK(GraspEvaluator):
     ) -> Float[Tensor, "view grasp stage shape point feature"]:
         """What each point tells, squashed to the order of one."""
         hand = default_hand()
-        way = grasps[:, :, STAGES]
+        way = grasps[:, :, self.stages]
         in_palm = hand.shape_poses(hand.forward_kinematics(way[..., JOINTS]))
         points, normals = torch.einsum("vgwsij,asnj->avgwsni", in_palm[..., :3, :3], self.points.to(grasps))
         points = points + in_palm[..., None, :3, 3]
