@@ -84,8 +84,6 @@ def variants(
     }
     if judge is None:
         known["judge ffh"] = by_refine(model, dexzoo.load("ffh"))
-    else:
-        known["no judge"] = by_refine(model, None)
 
     def add(source: str, name: str, variant: Variant) -> None:
         if name in known:

@@ -18,7 +18,7 @@ GROUP = "group "
 HEADS = {
     "refinement": "",
     "refinement_ablation": "### What each term is worth, and other weights as guides\n\n",
-    "refinement_validation": "### With a judge (method) and without, on validation objects\n\n",
+    "refinement_validation": "### With a judge and without, on validation objects\n\n",
     "refinement_meshes": "### On objects from elsewhere\n\n",
 }
 """What stands over each run of the benchmark."""
