@@ -42,6 +42,7 @@ def whole(found: dict[str, Any]) -> str:
     alike = "; several are of one object, so that for objects they are somewhat too narrow" if several else ""
     went = heads(first["transitions"])
     rules = first["top1"]
+    every = [rule for rule in RULES if any(rule in row["top1"] for row in variants.values())]
     return "\n".join(
         [
             f"`benchmarks/refine.py`; {first['scenes']} scenes of {first['objects']} objects ({found['split']}), at "
@@ -69,9 +70,9 @@ def whole(found: dict[str, Any]) -> str:
             ),
             "The first of each scene after refinement, by variant:\n",
             table(
-                ("variant", *(RULES[rule] for rule in rules)),
+                ("variant", *(RULES[rule] for rule in every)),
                 [
-                    (other, *(rate(row["top1"][rule]["refined"]) if rule in row["top1"] else "" for rule in rules))
+                    (other, *(rate(row["top1"][rule]["refined"]) if rule in row["top1"] else "" for rule in every))
                     for other, row in variants.items()
                 ],
             ),
