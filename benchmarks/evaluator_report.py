@@ -1,6 +1,5 @@
 """What benchmarks/report.py writes of the evaluators, from the JSON of several benchmarks."""
 
-import json
 from collections.abc import Iterable
 from typing import Any
 
@@ -9,7 +8,7 @@ from tables import RESULTS, percent, read, span, table
 
 from dexzoo.comparison.compare import GENERATED
 from dexzoo.comparison.report import NOTES, against_em2, cost_table, counts_table, main_table, title
-from dexzoo.resources import resource
+from dexzoo.models.zoo import shipped_card
 
 THESIS = {
     "gm": {"top1": 1070 / 1539},
@@ -77,21 +76,16 @@ def beside_thesis(section: dict[str, Any]) -> str:
 
 def grasps_seen(names: Iterable[str]) -> str:
     """How many grasps each model saw in training, as far as its card tells."""
-    seen = ", ".join(f"`{name}` {run['grasps_seen']:,}" for name in names if (run := card(name)).get("grasps_seen"))
+    cards = {name: found for name in names if (found := shipped_card(name)) and "grasps_seen" in found}
+    seen = ", ".join(f"`{name}` {found['grasps_seen']:,}" for name, found in cards.items())
     return f"Grasps seen in training, each time that one was drawn counted: {seen}.\n"
-
-
-def card(name: str) -> dict[str, Any]:
-    """The card of a model that comes with weights; empty where none does."""
-    path = resource("checkpoints") / f"{name}.json"
-    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def of_other_data(found: dict[str, Any]) -> list[str]:
     """What has to be known of models that have learnt from another grasp set than the one compared on."""
     told = []
     for name in found["weights"]:
-        data = card(name).get("data", {})
+        data = (shipped_card(name) or {}).get("data", {})
         if data and data.get("sha256") != found["data"]["sha256"]:
             told.append(f"`{name}` has learnt from {data['train_grasps']:,} grasps of another, earlier set.\n")
     return told
@@ -189,9 +183,9 @@ def account(runs: dict[str, Any]) -> list[str]:
     """Why em1 and em2 stay below the thesis' figures; nothing before the learning curve of one has been run."""
     curves = {}
     for name in ("em1", "em2"):
-        curve = [runs.get(f"{name}@10"), runs.get(f"{name}@30"), runs.get(name)]
-        if all(curve):
-            curves[name] = ", ".join(f"{run['figures'][GENERATED]['auroc']['value']:.3f}" for run in curve if run)
+        curve = (f"{name}@10", f"{name}@30", name)
+        if all(run in runs for run in curve):
+            curves[name] = ", ".join(f"{runs[run]['figures'][GENERATED]['auroc']['value']:.3f}" for run in curve)
     if not curves:
         return []
     section, once = (
@@ -205,7 +199,7 @@ def account(runs: dict[str, Any]) -> list[str]:
         f"order, which learns from no outcome, is right first in {percent(gm['top1']['value'])} of the scenes, in the "
         f"thesis in {percent(THESIS['gm']['top1'])}. The labels are not what limits: one trial foretells another of "
         f"the same grasp in {percent(once['accuracy']['value'])}, `em_fk` is right in "
-        f"{percent(best['accuracy']['value'])}. Data are: with 10, 30 and 100 % of the training scenes AUROC is "
+        f"{percent(best['accuracy']['value'])}. With 10, 30 and 100 % of the training scenes AUROC is "
         f"{told}; the thesis trained on 20,025 scenes with 1,081,332 grasps, and saw each some 18 times.\n"
     ]
 
