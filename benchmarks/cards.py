@@ -75,9 +75,10 @@ def training(card: dict[str, Any]) -> str:
     """Data, run and validation."""
     data = card["data"]
     settings = {f"{part}, {name}": value for part, own in card.get("config", {}).items() for name, value in own.items()}
+    seen = f"{card['grasps_seen']:,}, each time that one was drawn counted"
     rows = [
         ("grasps", f"{data['train_grasps']:,}"),
-        ("grasps seen", f"{card['grasps_seen']:,}, each time that one was drawn counted"),
+        ("grasps seen", seen if card["grasps_seen"] else "by its members alone; the grasps of validation calibrate it"),
         ("grasp set", f"format {data['version']}, SHA-256 of its tables `{data['sha256']}`"),
         ("command", f"`{card['command']}`"),
         ("seed", card["seed"]),

@@ -52,6 +52,17 @@ def comparison(found: dict[str, Any]) -> str:
         "![Success by place in the ranking](comparison/rank.png)\n",
         "![Calibration](comparison/reliability.png)\n",
         "![Success of the first grasp by category](comparison/categories.png)\n",
+        "What `em2` makes of an image: its three channels, and the feature maps of the frozen trunk that vary most "
+        "(thesis, Fig. 3.5).\n",
+        "![Feature maps of em2](comparison/em2_maps.png)\n",
+        "The same image in `em_fk`, whose small pyramid was trained with the rest.\n",
+        "![Feature maps of em_fk](comparison/em_fk_maps.png)\n",
+        "About a thousand grasps as first two principal components: as the 280 numbers that `em2` is given, and as "
+        "what its hand branch makes of them (Fig. 3.6), by outcome and by type. The branch sees no image.\n",
+        "![Grasps in em2](comparison/em2_grasps.png)\n",
+        "The same of `em_fk`, which has no such branch: what its last layer is given, where grasp and image are "
+        "joined.\n",
+        "![Grasps in em_fk](comparison/em_fk_grasps.png)\n",
     ]
     return "\n".join(parts)
 
@@ -76,7 +87,7 @@ def beside_thesis(section: dict[str, Any]) -> str:
 
 def grasps_seen(names: Iterable[str]) -> str:
     """How many grasps each model saw in training, as far as its card tells."""
-    cards = {name: found for name in names if (found := shipped_card(name)) and "grasps_seen" in found}
+    cards = {name: found for name in names if (found := shipped_card(name)) and found.get("grasps_seen")}
     seen = ", ".join(f"`{name}` {found['grasps_seen']:,}" for name, found in cards.items())
     return f"Grasps seen in training, each time that one was drawn counted: {seen}.\n"
 

@@ -246,8 +246,7 @@ def _compare(options: Namespace) -> Result:
     models, data = load_models(options.models), GraspDataModule(options.data)
     result = compare(models, data, options.split, options.seed)
     if options.out is not None:
-        write(result, options.out)
-        draw_inside(models, data, options.split, options.out)
+        write(result, options.out, draw_inside(models, data, options.split, options.out))
     return result, terminal_table(result)
 
 

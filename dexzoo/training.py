@@ -93,10 +93,14 @@ class CommandLine(LightningCLI):
         """Overrides Lightning, which would let a checkpoint's hyper-parameters beat the given configuration."""
 
     def fit(self, ckpt_path: str | None, **_: object) -> None:
-        """Train, then write the best averaged weights and their card into the run's folder."""
+        """Train, then write the best averaged weights and their card into the run's folder.
+
+        What has nothing to train, such as an ensemble, is calibrated and written.
+        """
         self._load(ckpt_path)
         resumed = ckpt_path if ckpt_path and _is_checkpoint(ckpt_path) else None
-        self.trainer.fit(self.model, datamodule=self.datamodule, ckpt_path=resumed, weights_only=True)
+        if any(parameter.requires_grad for parameter in self.model.parameters()):
+            self.trainer.fit(self.model, datamodule=self.datamodule, ckpt_path=resumed, weights_only=True)
         if self._get(self.config, "trainer").fast_dev_run:
             return
         best = self.trainer.checkpoint_callback
@@ -171,7 +175,7 @@ class CommandLine(LightningCLI):
 
 @torch.no_grad()
 def calibrate(model: GraspEvaluator, data: GraspDataModule) -> None:
-    """Fit a model's probabilities to the validation split, as `fit` does at its end; an ensemble's by hand.
+    """Fit a model's probabilities to the validation split.
 
     They stay as they are, with a warning, where the split has one outcome only.
     """

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from dexzoo.comparison.compare import compare, load_models
 from dexzoo.comparison.inside import draw_inside, feature_maps, grasp_features, principal_components
-from dexzoo.comparison.report import advice, main_table, markdown, terminal_table, write
-from dexzoo.comparison.scores import encoded_views, model_scores
+from dexzoo.comparison.report import advice, category_table, main_table, markdown, terminal_table, write
+from dexzoo.comparison.scores import encoded_views, first_image, measure, model_scores
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
 from dexzoo.grasp import JOINTS, SQUEEZE, Grasps
@@ -195,9 +195,12 @@ def test_the_folder_holds_tables_numbers_and_pictures(
     data: GraspDataModule, models: dict[str, GraspEvaluator], tmp_path: Path
 ) -> None:
     result = compare(models, data)
-    write(result, tmp_path)
+    write(result, tmp_path, [tmp_path / "em2_maps.png"])
     assert json.loads((tmp_path / "comparison.json").read_text()) == result
-    assert (tmp_path / "comparison.md").read_text() == markdown(result)
+    page = (tmp_path / "comparison.md").read_text()
+    assert page.startswith(markdown(result))
+    assert page.count("![") == 4
+    assert "![em2_maps](em2_maps.png)" in page
     for name in ("rank", "reliability", "categories"):
         picture = cv2.imread(str(tmp_path / f"{name}.png"))
         assert min(picture.shape[:2]) > 200
@@ -214,6 +217,28 @@ def test_the_best_of_a_column_is_bold(data: GraspDataModule, models: dict[str, G
         assert not wrong[head.index(name)].startswith("**"), name
     assert right[head.index("accuracy")] == "**100.0** (100.0 to 100.0)"
     assert gm[head.index("Brier")] == ""
+
+
+def test_every_category_has_a_row(data: GraspDataModule, models: dict[str, GraspEvaluator]) -> None:
+    section = compare(models, data)["sources"]["generated"]
+    head, rows = category_table(section)
+    assert head == ["category", "scenes", "grasps", "hold", "right", "wrong", "gm", "coin"]
+    shares = [float(row[3]) for row in rows]
+    assert shares == sorted(shares, reverse=True)
+    assert sum(int(row[1]) for row in rows) == 5
+    assert sum(int(row[2]) for row in rows) == 150
+    assert {tuple(row[4:6]) for row in rows} == {("100.0, 100.0", "0.0, 0.0")}
+
+
+def test_a_trunk_is_counted_once_and_apart(data: GraspDataModule, tmp_path: Path) -> None:
+    em2 = EM2(width=16)
+    pair = Ensemble(members=[str(em2.save(tmp_path / "a")), str(em2.save(tmp_path / "b"))])
+    file = ROOT / "assets" / "checkpoints" / "vgg16_hed.safetensors"
+    grasps = data.dataset("test", Closure()).aimed(torch.arange(2))
+    image = first_image(data, "test")
+    for model in (em2, pair):
+        assert measure(model, image, grasps).trunk_megabytes == round(file.stat().st_size / 1e6, 1)
+    assert measure(Closure(), image, grasps).trunk_megabytes == 0
 
 
 def summary(top1: dict[str, float], held: tuple[int, int], p: float) -> dict[str, Any]:
@@ -321,9 +346,9 @@ def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
         hand.upper - hand.lower
     )
     torch.testing.assert_close(features, share)
-    draw_inside({"em2": em2, "runs/closure": Closure()}, data, "test", tmp_path)
-    names = {path.name for path in tmp_path.glob("*.png")}
-    assert names == {"em2_maps.png", "em2_grasps.png", "runs_closure_grasps.png"}
+    drawn = draw_inside({"em2": em2, "runs/closure": Closure()}, data, "test", tmp_path)
+    assert [path.name for path in drawn] == ["em2_maps.png", "em2_grasps.png", "runs_closure_grasps.png"]
+    assert set(drawn) == set(tmp_path.glob("*.png"))
 
 
 def test_what_has_nothing_inside_is_left_out(data: GraspDataModule, ensemble: Ensemble, tmp_path: Path) -> None:

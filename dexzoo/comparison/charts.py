@@ -17,14 +17,14 @@ _MIN_GRASPS = 10
 """Fewer in a bin say nothing of its success rate."""
 
 
-def draw_charts(result: dict[str, Any], folder: Path) -> None:
-    """Write rank.png, reliability.png and categories.png of the first source, the generated grasps."""
+def draw_charts(result: dict[str, Any], folder: Path) -> list[Path]:
+    """Write rank.png, reliability.png and categories.png of the first source, the generated grasps; their paths."""
     section = next(iter(result["sources"].values()))
     rows = dict(section["rows"])
-    save(rank_chart(rows, section["success_rate"]), folder / "rank.png")
+    rank = save(rank_chart(rows, section["success_rate"]), folder / "rank.png")
     del rows[COIN]  # a coin has nothing to say of probabilities and categories
-    save(reliability_chart(rows), folder / "reliability.png")
-    save(category_chart(rows), folder / "categories.png")
+    reliability = save(reliability_chart(rows), folder / "reliability.png")
+    return [rank, reliability, save(category_chart(rows), folder / "categories.png")]
 
 
 def rank_chart(rows: Rows, base: float) -> Figure:
@@ -82,9 +82,10 @@ def category_chart(rows: Rows) -> Figure:
     return figure
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a chart as PNG."""
+def save(figure: Figure, path: Path) -> Path:
+    """Write a chart as PNG; returns the path."""
     figure.savefig(path, dpi=120, bbox_inches="tight", metadata={"Software": None})
+    return path
 
 
 def _axes(width: float, height: float) -> tuple[Figure, Axes]:

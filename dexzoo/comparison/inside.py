@@ -26,21 +26,23 @@ BRANCH = "hand_branch"
 _COLUMNS = 5
 
 
-def draw_inside(models: Mapping[str, GraspEvaluator], data: GraspDataModule, split: str, folder: Path) -> None:
-    """Write NAME_maps.png and NAME_grasps.png into a folder, each for the models that have what it shows."""
-    image = first_image(data, split)
+def draw_inside(models: Mapping[str, GraspEvaluator], data: GraspDataModule, split: str, folder: Path) -> list[Path]:
+    """Write NAME_maps.png and NAME_grasps.png, each for the models that have what it shows; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    image, drawn = first_image(data, split), []
     for name, model in models.items():
         stem = name.strip("/").replace("/", "_")
         maps = feature_maps(model, image)
         if maps is not None:
-            save(maps_picture(image, maps), folder / f"{stem}_maps.png")
+            drawn.append(save(maps_picture(image, maps), folder / f"{stem}_maps.png"))
         dataset = data.dataset(split, model)
         found = grasp_features(model, dataset)
         if found is not None:
             rows, features = found
             where = "after the hand branch" if BRANCH in dict(model.named_modules()) else "before the last layer"
             picture = components_picture(dataset.aimed(rows), features, dataset.success[rows] > 0.5, where)
-            save(picture, folder / f"{stem}_grasps.png")
+            drawn.append(save(picture, folder / f"{stem}_grasps.png"))
+    return drawn
 
 
 @torch.no_grad()

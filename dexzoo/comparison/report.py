@@ -47,6 +47,7 @@ _COUNTS = {"tp": "tp", "fp": "fp", "tn": "tn", "fn": "fn"}
 _COST = {
     "parameters": "parameters",
     "megabytes": "MB",
+    "trunk_megabytes": "MB of its trunk",
     "milliseconds_per_view": "ms a view",
     "milliseconds_per_1000_grasps": "ms for 1,000 grasps",
     "threads": "threads",
@@ -64,6 +65,12 @@ each column is bold.
 AGAINST_EM2 = """\
 What each gains over em2 on the same grasps: points of accuracy and of top-1, and how many % of em2's failures in top-1
 it removes, less those that it adds. Then in how many scenes whose first grasp holds, and McNemar's exact p.
+"""
+
+
+CATEGORIES = """\
+By category, the most difficult last: accuracy, and in how many % of the scenes the first grasp holds; the latter alone
+where a row predicts no outcome.
 """
 
 
@@ -166,6 +173,21 @@ def cost_table(cost: dict[str, dict[str, Any]]) -> Cells:
     return Cells(["", *_COST.values()], [[label, *(told(row[name]) for name in _COST)] for label, row in cost.items()])
 
 
+def category_table(section: dict[str, Any]) -> Cells:
+    """Accuracy, and in how many % of the scenes the first grasp holds, by category, the most difficult last."""
+    rows = section["rows"]
+    categories = next(iter(rows.values()))["by_category"]
+    found = Cells(["category", "scenes", "grasps", "hold", *rows], [])
+    for name in sorted(categories, key=lambda name: -categories[name]["success_rate"]):
+        cells = [f"{categories[name]['scenes']:,}", f"{categories[name]['grasps']:,}"]
+        cells.append(_number(categories[name]["success_rate"], _COLUMNS["accuracy"]))
+        for row in rows.values():
+            figures = [_number(row["by_category"][name].get(key), _COLUMNS[key]) for key in ("accuracy", "top1")]
+            cells.append(", ".join(filter(None, figures)))
+        found.rows.append([name, *cells])
+    return found
+
+
 def title(source: str, section: dict[str, Any]) -> str:
     """What a table is about."""
     return (
@@ -175,11 +197,11 @@ def title(source: str, section: dict[str, Any]) -> str:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The whole comparison: `advice`, for each source the main table and the counts, then the cost."""
+    """The whole comparison: `advice`, for each source its tables, then the cost."""
     parts = [f"# Comparison on the {result['split']} split\n", f"{advice(result)}\n", NOTES]
     for source, section in result["sources"].items():
         parts += [f"## {title(source, section)}\n", table(*main_table(section)), table(*counts_table(section))]
-        parts += against_em2(section)
+        parts += [*against_em2(section), CATEGORIES, table(*category_table(section))]
     parts += ["## Cost\n", table(*cost_table(result["cost"]))]
     return "\n".join(parts)
 
@@ -190,12 +212,15 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join([first, "|" + "---|" * len(head), *others]) + "\n"
 
 
-def write(result: dict[str, Any], folder: Path) -> None:
-    """Write comparison.md, comparison.json and the charts into a folder."""
+def write(result: dict[str, Any], folder: Path, pictures: Iterable[Path] = ()) -> None:
+    """Write comparison.md, comparison.json and the charts into a folder.
+
+    pictures: that are there already, to be shown in comparison.md after the charts.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "comparison.md").write_text(markdown(result))
+    shown = [f"![{path.stem}]({path.name})\n" for path in (*draw_charts(result, folder), *pictures)]
+    (folder / "comparison.md").write_text("\n".join([markdown(result), "## Pictures\n", *shown]))
     (folder / "comparison.json").write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
-    draw_charts(result, folder)
 
 
 def _best(figures: list[dict[str, Any] | None], name: str) -> float | None:

@@ -18,8 +18,9 @@ from torch import Tensor
 
 from dexzoo.data.datamodule import GraspDataModule, GraspDataset
 from dexzoo.data.schema import SPLITS
-from dexzoo.models.encoders import has_bfloat16
+from dexzoo.models.encoders import DepthEncoder, has_bfloat16
 from dexzoo.models.evaluator import CHUNK, GraspEvaluator, Scene
+from dexzoo.models.trunks import trunk_bytes
 
 GM, COIN = "gm", "coin"
 """The rows that every comparison has: the generative model, ranking by its own likelihood, and chance."""
@@ -83,8 +84,9 @@ class Scores:
 class Cost:
     """What a model takes.
 
-    parameters: those trained; the frozen trunk, shared by models, has its own. megabytes: of the file that it was read
-    from, or else that `save` would write, without the trunk. An ensemble's members count in both.
+    parameters: those trained. megabytes: of the file that it was read from, or else that `save` would write, without
+    the frozen trunk, which models share. trunk_megabytes: of the trunk as dexzoo keeps it, or else in memory; 0 without
+    one. An ensemble's members count in all.
     milliseconds_per_view, milliseconds_per_1000_grasps: best of three on `threads` threads; the view is encoded by the
     trunk and all, the grasps are scored on one view. processor: whose they are, and whether it has instructions for
     bfloat16.
@@ -92,6 +94,7 @@ class Cost:
 
     parameters: int
     megabytes: float
+    trunk_megabytes: float
     milliseconds_per_view: float
     milliseconds_per_1000_grasps: float
     threads: int
@@ -183,9 +186,11 @@ def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: 
         scoring = _best_time(lambda: [model.logit(scene, part[None]) for part in grasps.split(CHUNK)])
     with tempfile.TemporaryDirectory() as folder:
         size = sum(part.num_bytes or part.save(folder).stat().st_size for part in model.parts)
+    trunks = {layer.name for part in model.parts for layer in part.modules() if isinstance(layer, DepthEncoder)}
     return Cost(
         sum(parameter.numel() for part in model.parts for parameter in part.parameters()),
         round(size / 1e6, 1),
+        round(sum(map(trunk_bytes, trunks)) / 1e6, 1),
         round(1000 * view, 1),
         round(1000 * scoring, 1),
         torch.get_num_threads(),

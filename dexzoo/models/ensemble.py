@@ -14,7 +14,7 @@ from dexzoo.models.zoo import load
 
 
 class Ensemble(GraspEvaluator):
-    """Members that were trained one by one; nothing here is trained but the calibration.
+    """Members that were trained one by one; nothing of its own but the calibration, which `dexzoo fit` sets.
 
     members: what `dexzoo.load` takes: names of models, files or folders; em_fk alone where none are given. They are
     loaded, not copied: a saved ensemble holds their names and its own calibration, and needs them where they were.
@@ -68,4 +68,4 @@ class Ensemble(GraspEvaluator):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Raises ValueError: there is nothing to train."""
-        raise ValueError("an ensemble is not trained; train its members, then save Ensemble(members=[...])")
+        raise ValueError("an ensemble has nothing to train; `python -m dexzoo fit` calibrates it")

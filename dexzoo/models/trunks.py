@@ -155,6 +155,14 @@ def trunk_card(name: str) -> dict[str, Any] | None:
     return card
 
 
+def trunk_bytes(name: str) -> int:
+    """Size of the file that a trunk comes in, or, of one that is fetched, of its weights in memory."""
+    file = trunk(name).weights
+    if isinstance(file, str):
+        return (resource("checkpoints") / f"{file}.safetensors").stat().st_size
+    return sum(value.numel() * value.element_size() for value in load_trunk(name).state_dict().values())
+
+
 @cache
 def load_trunk(name: str) -> nn.Module:
     """A trunk with its weights, frozen; one copy of each is shared by all models.

@@ -97,8 +97,6 @@ def _shipped(name: str) -> Path:
 
 def how_to_get(name: str) -> str:
     """What to do for weights of a name of `list_models` that comes without."""
-    if name == "ensemble":
-        return "make one of trained models with Ensemble(members=[...]).save(FOLDER) and load the folder"
     ours = f"{name}-adamw.yaml"
     config = ours if (resource("configs") / ours).is_file() else f"{name}.yaml"
     first = "make its trunk by `python assets/checkpoints/train_resnet50.py`, then " if name == "em3" else ""
