@@ -185,14 +185,13 @@ def described(folder: Path, run: Run, model: GraspEvaluator, data: GraspDataModu
 def replicated(model: GraspEvaluator, data: GraspDataModule, labels: Labels, source: str) -> dict[str, Replicates]:
     """Each figure (1 + draw,), first of the scenes as they are, then of each draw of scenes."""
     scores = model_scores(model, data.dataset("test", model, [source]), f"{model.architecture} on {source} grasps")
-    weights = np.concatenate((np.ones((1, labels.num_scenes)), draw_scenes(labels.num_scenes, seed=0)))
-    found = figures(labels, scores, weights)
+    found = figures(labels, scores, draw_scenes(labels.num_scenes, seed=0))
     return {key: found[key] for key in FIGURES}
 
 
 def with_intervals(found: dict[str, Replicates]) -> dict[str, Any]:
     """Value and 95 % interval of each figure."""
-    return {key: with_interval(replicates[:1], replicates[1:]) for key, replicates in found.items()}
+    return {key: with_interval(replicates) for key, replicates in found.items()}
 
 
 if __name__ == "__main__":

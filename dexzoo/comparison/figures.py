@@ -1,8 +1,8 @@
 """The figures of one row, each with its bootstrap interval over scenes.
 
 Grasps of one scene share object, pose and luck, so that scenes are what is drawn anew. A draw is how often each scene
-is taken, and every figure is a function of such weights (draw, scene): ones give the figure itself, and a matrix of a
-thousand draws gives all its replicates at once, without a grasp being copied.
+is taken, and every figure is a function of such weights (draw, scene): a row of ones gives the figure itself, and a
+thousand draws give all its replicates at once, without a grasp being copied.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ _CHUNK = 50
 
 
 def draw_scenes(num_scenes: int, seed: int, num_draws: int = NUM_DRAWS) -> Array:
-    """(draw, scene) how often each scene is taken when as many as there are are drawn with replacement."""
+    """(1 + draw, scene) how often each is taken: once, then when as many as there are are drawn with replacement."""
     share = np.full(num_scenes, 1 / num_scenes)
-    return np.random.default_rng(seed).multinomial(num_scenes, share, num_draws).astype(np.float64)
+    drawn = np.random.default_rng(seed).multinomial(num_scenes, share, num_draws)
+    return np.concatenate((np.ones((1, num_scenes)), drawn))
 
 
 def describe(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
@@ -45,13 +46,12 @@ def describe(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
     by_rank: success rate of each tenth of the scenes' rankings, best first. reliability: of each bin of probability,
     the grasps, their mean probability and their success rate. by_category: grasps, scenes and a few figures of each.
     """
-    once = np.ones((1, labels.num_scenes))
     tenths = by_scene(SuccessByRank(), labels, scores).T
     return {
         "figures": figures_with_intervals(labels, scores, draws),
         "threshold": scores.threshold,
         "counts": counts(labels, scores),
-        "by_rank": [with_interval(mean(tenth, once), mean(tenth, draws)) for tenth in tenths],
+        "by_rank": [with_interval(mean(tenth, draws)) for tenth in tenths],
         "reliability": reliability(labels, scores),
         "by_category": {str(name): _of_category(name, labels, scores) for name in np.unique(labels.category)},
     }
@@ -59,8 +59,7 @@ def describe(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
 
 def figures_with_intervals(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
     """Value and 95 % interval of every figure of a row, plain values."""
-    value, replicates = figures(labels, scores, np.ones((1, labels.num_scenes))), figures(labels, scores, draws)
-    return {name: with_interval(value[name], replicates[name]) for name in value}
+    return {name: with_interval(values) for name, values in figures(labels, scores, draws).items()}
 
 
 def figures(labels: Labels, scores: Scores, weights: Array) -> dict[str, Array]:
@@ -174,11 +173,10 @@ def gains(
     right, other_right, scene: (case,). difference: of the rates at which they are right. failures_removed: the share of
     the other's failures that are gone, less those that are new; negative where there are more.
     """
-    once = np.ones((1, draws.shape[1]))
     columns = (right * 1.0 - other_right, np.ones(len(right)), ~other_right)
     gained, cases, failures = (np.bincount(scene, column, draws.shape[1]) for column in columns)
     return {
-        name: with_interval(*(_ratio(weights @ gained, weights @ whole) for weights in (once, draws)))
+        name: with_interval(_ratio(draws @ gained, draws @ whole))
         for name, whole in (("difference", cases), ("failures_removed", failures))
     }
 
@@ -211,11 +209,12 @@ def _of_category(name: str, labels: Labels, scores: Scores) -> dict[str, Any]:
     }
 
 
-def with_interval(value: Array, replicates: Array) -> dict[str, Any]:
-    """A figure and its 95 % interval, from the replicates for which it is defined."""
+def with_interval(values: Array) -> dict[str, Any]:
+    """A figure and its 95 % interval, of (1 + draw,) values the first and those of the rest that are defined."""
+    value, replicates = values[0], values[1:]
     known = replicates[np.isfinite(replicates)]
     interval = [_plain(x) for x in np.percentile(known, [2.5, 97.5])] if len(known) else None
-    return {"value": _plain(value[0]), "interval": interval}
+    return {"value": _plain(value), "interval": interval}
 
 
 def _plain(value: float) -> float | None:

@@ -43,7 +43,7 @@ _COLUMNS = {
     "top5": _Column("top-5", 100, 1),
 }
 _BRIEF = ("accuracy", "auroc", "scene_auroc", "calibration_error", "top1", "top5")
-_COUNTS = {"tp": "tp", "fp": "fp", "tn": "tn", "fn": "fn"}
+_COUNTS = ("tp", "fp", "tn", "fn")
 _COST = {
     "parameters": "parameters",
     "megabytes": "MB",
@@ -143,7 +143,7 @@ def advice(result: dict[str, Any]) -> str:
 def counts_table(section: dict[str, Any]) -> Cells:
     """True and false positives and negatives (thesis, Table 3.3), and the cross table of top-1 with gm (Table 3.4)."""
     names = _cross(GM)
-    found = Cells(["", *_COUNTS.values(), *names.values()], [])
+    found = Cells(["", *_COUNTS, *names.values()], [])
     for label, row in section["rows"].items():
         counts, cross = row["counts"] or {}, row.get("against_gm", {}).get("top1", {})
         cells = [*(counts.get(name) for name in _COUNTS), *(cross.get(name) for name in names)]
