@@ -33,6 +33,7 @@ from dexzoo.resources import resource
 
 NUM_VALIDATIONS = 10
 REFINED = "refined"
+THESIS_DROPOUT = 0.5
 Replicates = NDArray[np.float64]
 FIGURES = ("accuracy", "auroc", "scene_auroc", "average_precision", "calibration_error", "top1", "top5")
 
@@ -63,6 +64,8 @@ def runs() -> dict[str, Run]:
     known["em_fk+refined"] = Run("em_fk.yaml", {"data.sources": SOURCES}, "em_fk")
     known["em_fk+seed"] = Run("em_fk.yaml", base | {"seed_everything": 1, "data.seed": 1}, "em_fk")
     known["em2+4096"] = Run("em2-adamw.yaml", base | {"model.width": 4096}, "em2")
+    for name in ("em1", "em2"):
+        known[f"{name}+dropout"] = Run(whole[name], base | {"model.dropout": THESIS_DROPOUT}, name)
     known["em1+thesis"] = Run("em1.yaml", {}, "em1")
     known["em2+thesis"] = Run("em2.yaml", {}, "em2")
     return known

@@ -170,7 +170,8 @@ def ablation(found: dict[str, Any]) -> str:
         WITHOUT: "What each ingredient brings; a minus stands for without:",
         LESS_DATA: "With 10, 30 and 100 % of the training scenes:",
         VARIANT: "With refined grasps besides; with another seed, which tells what chance brings; with the width of "
-        "the thesis' table; and by the thesis' recipe, cut to as many grasps as the others see:",
+        "the thesis' table; with the thesis' dropout, 0.5; and by the thesis' recipe, cut to as many grasps as the "
+        "others see:",
     }
     sizes = ", ".join(f"{size['grasps']:,} {source}" for source, size in found["test"].items())
     seen = " or ".join(f"{count:,}" for count in sorted({row["grasps_seen"] for row in runs.values()}))

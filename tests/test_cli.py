@@ -239,7 +239,7 @@ def test_models_are_listed(run: Run) -> None:
     status, out, err = run("models")
     assert (status, err) == (0, "")
     assert all(name in out for name in list_models())
-    assert how_to_get("ensemble") in " ".join(out.split())
+    assert how_to_get("em3") in " ".join(out.split())
 
 
 # help
