@@ -259,8 +259,8 @@ def training(found: dict[str, Any]) -> str:
         for name, value in part["seconds_for_1000_grasps"].items()
     ]
     return (
-        f"### A view encoded once\n\n`benchmarks/training.py`; EM2, {found['threads']} thread(s). Training with kept "
-        f"features is {learning['ratio']:.0f} times faster than with the trunk in the loop, and "
-        f"{learning['ratio_in_the_first_epoch']:.0f} times in the first epoch, which encodes all views; scoring "
-        f"grasps on one view is {scoring['ratio']:.0f} times faster than pair by pair.\n\n"
+        f"### A view encoded once\n\n`benchmarks/training.py`; EM2, {found['threads']} thread(s) of "
+        f"{found['processor']}. Training with kept features is {learning['ratio']:.0f} times faster than with the "
+        f"trunk in the loop, and {learning['ratio_in_the_first_epoch']:.0f} times in the first epoch, which encodes "
+        f"all views; scoring grasps on one view is {scoring['ratio']:.0f} times faster than pair by pair.\n\n"
     ) + table(("", "1,000 grasps with", "processor seconds"), rows)

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import dexzoo
+from dexzoo.comparison.scores import processor
 from dexzoo.data.datamodule import Draw, GraspDataModule
 from dexzoo.models.em2 import EM2
 from dexzoo.models.encoders import has_bfloat16
@@ -38,7 +39,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     data = GraspDataModule(options.data, num_scenes=NUM_SCENES)
-    result = {"threads": torch.get_num_threads(), "training": training(data), "scoring": scoring(data)}
+    machine = {"threads": torch.get_num_threads(), "processor": processor()}
+    result = machine | {"training": training(data), "scoring": scoring(data)}
     text = json.dumps(result, indent=2)
     if options.out:
         options.out.write_text(text + "\n")

@@ -98,15 +98,15 @@ class CommandLine(LightningCLI):
         What has nothing to train, such as an ensemble, is calibrated and written.
         """
         self._load(ckpt_path)
-        resumed = ckpt_path if ckpt_path and _is_checkpoint(ckpt_path) else None
         if any(parameter.requires_grad for parameter in self.model.parameters()):
+            resumed = ckpt_path if ckpt_path and _is_checkpoint(ckpt_path) else None
             self.trainer.fit(self.model, datamodule=self.datamodule, ckpt_path=resumed, weights_only=True)
         if self._get(self.config, "trainer").fast_dev_run:
             return
         best = self.trainer.checkpoint_callback
         if isinstance(best, ModelCheckpoint) and best.best_model_path:
             self._load(best.best_model_path)
-        calibrate(self.model, self.datamodule)
+        self._calibrate()
         metrics = self.trainer.validate(self.model, datamodule=self.datamodule, verbose=False)[0]
         card = {
             "data": self.datamodule.describe(),
@@ -155,6 +155,18 @@ class CommandLine(LightningCLI):
         arguments = loaded.arguments if type(loaded) is type(self.model) else None
         load_weights(self.model, loaded.state_dict(), ckpt_path, arguments)
 
+    @torch.no_grad()
+    def _calibrate(self) -> None:
+        """Fit the probabilities to the validation split; where that has one outcome only they stay, with a warning."""
+        self.model.eval()
+        dataset = self.datamodule.dataset("validation", self.model)
+        if not 0 < dataset.success.sum() < len(dataset):
+            _log.warning("the validation split has one outcome only; probabilities stay uncalibrated")
+            return
+        rows = torch.arange(len(dataset)).split(self.datamodule.batch_size)  # all of them in each process
+        logit = torch.cat([self.model.batch_logit(dataset[part.tolist()]) for part in rows])
+        self.model.calibrate(logit, dataset.success)
+
     def _settings(self) -> dict[str, Any]:
         """What a card says of the run, besides the model's arguments: how data were drawn and the trainer was set."""
         asked = yaml.safe_load(self._parser("fit").dump(self.config["fit"], skip_default=True))
@@ -171,22 +183,6 @@ class CommandLine(LightningCLI):
             return
         for name, value in (results.pop("metrics", {}) | results).items():
             sys.stdout.write(f"{name:30} {value:.4f}\n" if isinstance(value, float) else f"{name:30} {value}\n")
-
-
-@torch.no_grad()
-def calibrate(model: GraspEvaluator, data: GraspDataModule) -> None:
-    """Fit a model's probabilities to the validation split.
-
-    They stay as they are, with a warning, where the split has one outcome only.
-    """
-    model.eval()
-    dataset = data.dataset("validation", model)
-    if not 0 < dataset.success.sum() < len(dataset):
-        _log.warning("the validation split has one outcome only; probabilities stay uncalibrated")
-        return
-    rows = torch.arange(len(dataset)).split(data.batch_size)  # all of them in each process
-    logit = torch.cat([model.batch_logit(dataset[part.tolist()]) for part in rows])
-    model.calibrate(logit, dataset.success)
 
 
 def _is_checkpoint(path: str | Path) -> bool:

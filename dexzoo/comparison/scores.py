@@ -194,11 +194,12 @@ def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: 
         round(1000 * view, 1),
         round(1000 * scoring, 1),
         torch.get_num_threads(),
-        _processor(),
+        processor(),
     )
 
 
-def _processor() -> str:
+def processor() -> str:
+    """This machine's, and whether it has instructions for bfloat16."""
     name = torch.cpu.get_capabilities()["cpu_name"]
     return f"{name}, {'with' if has_bfloat16(torch.device('cpu')) else 'without'} bfloat16"
 
