@@ -29,7 +29,7 @@ from dexzoo.models.evaluator import CHUNK, Batch
 KEPT_STEPS, TRUNK_STEPS = 16, 2
 NUM_VIEWS = 16
 NUM_GRASPS, NUM_PAIRS = 1000, 24
-NUM_SCENES = 4
+NUM_SCENES = 8
 """Of training; how many there are is nothing to the time of a step."""
 
 
@@ -73,8 +73,11 @@ def training(data: GraspDataModule) -> dict[str, Any]:
         batch = images[draw]
         step(batch._replace(views=model.encode(batch.views[batch.view]), view=torch.arange(len(draw.rows))))
 
-    kept = seconds(lambda rows: step(features[rows]), batches[:KEPT_STEPS]) / (KEPT_STEPS * data.batch_size)
-    trunk = seconds(with_trunk, batches[:TRUNK_STEPS]) / (TRUNK_STEPS * data.batch_size)
+    def per_grasp(work: Callable[[Draw], object], some: list[Draw]) -> float:
+        return seconds(work, some) / sum(len(draw.rows) for draw in some)
+
+    kept = per_grasp(lambda draw: step(features[draw]), batches[:KEPT_STEPS])
+    trunk = per_grasp(with_trunk, batches[:TRUNK_STEPS])
     view = seconds(lambda row: model.encode(images[row].views), [[row] for row in range(NUM_VIEWS)]) / NUM_VIEWS
     encoding = view * data.source.views.num_rows / data.source.grasps.num_rows  # its part in a grasp of the first epoch
     return {
