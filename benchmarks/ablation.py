@@ -2,8 +2,10 @@
 
 python benchmarks/ablation.py --list
 python benchmarks/ablation.py --runs em_fk em_fk-image --folder runs/ablation     # any of them, in any order, anywhere
-python benchmarks/ablation.py --done --out benchmarks/results/ablation.json       # sum up the runs that are finished
-Each run has a folder of its own: a finished run is not repeated, one that was killed goes on from its last checkpoint.
+python benchmarks/ablation.py --done                                              # sum up the runs that are finished
+Each run has a folder of its own: one that was killed goes on from its last checkpoint. Of a finished run there is a
+file in `--results` with its log-odds on the test grasps; it is not repeated, and its folder is needed no longer. The
+figures of all go into a JSON beside `--results`.
 All see as many grasps, `--grasps`, in batches of their configurations' size, whatever data they have; ten times on
 the way the averaged weights are validated, and the best are kept. The test objects choose nothing. Intervals are 95 %
 bootstrap over scenes, also of the difference from the run that a row is compared with.
@@ -13,7 +15,6 @@ import argparse
 import json
 import shutil
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,14 +22,15 @@ import numpy as np
 import torch
 import yaml
 from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 import dexzoo
 from dexzoo import training
 from dexzoo.comparison.figures import draw_scenes, figures, with_interval
-from dexzoo.comparison.scores import Labels, first_image, measure, model_scores, read_labels
+from dexzoo.comparison.scores import Labels, Scores, model_scores, read_labels
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SOURCES
-from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.resources import resource
 
 NUM_VALIDATIONS = 10
@@ -75,24 +77,31 @@ def main() -> None:
     known = runs()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", nargs="+", metavar="NAME", default=list(known), help="default: all, in this order")
-    parser.add_argument("--done", action="store_true", help="run nothing more, sum up what the folder holds")
+    parser.add_argument("--done", action="store_true", help="run nothing more, sum up what the results hold")
     parser.add_argument("--list", action="store_true", help="name the runs, and which are finished")
-    parser.add_argument("--grasps", type=int, default=1_000_000, help="that each run sees in training")
+    parser.add_argument("--grasps", type=int, default=150_000, help="that each run sees in training")
     parser.add_argument("--data", default="assets/grasps")
     parser.add_argument("--folder", type=Path, default=Path("runs/ablation"))
-    parser.add_argument("--out", type=Path, help="file for the figures of all finished runs")
+    parser.add_argument("--results", type=Path, default=Path("benchmarks/results/ablation"))
     options = parser.parse_args()
     if unknown := set(options.runs) - set(known):
         parser.error(f"runs {', '.join(sorted(unknown))} are unknown; use some of {', '.join(known)}")
     if options.list:
         for name in known:
-            sys.stdout.write(f"{name:16} {'finished' if finished(options.folder / name) else ''}\n")
+            sys.stdout.write(f"{name:16} {'finished' if result(options.results, name).exists() else ''}\n")
         return
     for name in [] if options.done else options.runs:
-        fit(options.folder / name, known[name], options.data, options.grasps)
-    if options.out:
-        result = measured(options.folder, known, options.data)
-        options.out.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
+        if not result(options.results, name).exists():
+            fit(options.folder / name, known[name], options.data, options.grasps)
+            keep(options.folder / name, options.results, options.data)
+    if options.done:
+        figures_of_all = measured(options.results, known, options.data)
+        options.results.with_suffix(".json").write_text(json.dumps(figures_of_all, indent=2, allow_nan=False) + "\n")
+
+
+def result(results: Path, name: str) -> Path:
+    """The file of a finished run."""
+    return results / f"{name}.safetensors"
 
 
 def finished(folder: Path) -> bool:
@@ -143,17 +152,61 @@ def configuration(run: Run, data: str, grasps: int) -> dict[str, Any]:
     return config
 
 
-def measured(folder: Path, known: dict[str, Run], address: str) -> dict[str, Any]:
-    """The figures of all finished runs on the test objects. ValueError for a run that saw another grasp set."""
+def keep(folder: Path, results: Path, address: str) -> None:
+    """Write what a run was, and its log-odds on the test grasps of each source, into the results.
+
+    ValueError for a run that saw another grasp set.
+    """
+    data = GraspDataModule(address)
+    card = json.loads(next(folder.glob("*.json")).read_text())
+    if card["data"]["sha256"] != data.source.sha256:
+        raise ValueError(f"{folder} was trained on another grasp set than {data.folder}; run it anew")
+    model = dexzoo.load(folder)
+    row = {
+        "config": yaml.safe_load(asked(folder).read_text()),
+        "data": card["data"]["sha256"],
+        "train_grasps": card["data"]["train_grasps"],
+        "validation_auroc": card["metrics"]["validation_auroc"],
+        "temperature": float(model.temperature),
+        "offset": float(model.offset),
+    }
+    logits = {
+        source: torch.from_numpy(model_scores(model, data.dataset("test", model, [source]), folder.name).score)
+        for source in SOURCES
+        if len(data.rows("test", [source]))
+    }
+    path = result(results, folder.name)
+    results.mkdir(parents=True, exist_ok=True)
+    save_file(logits, path.with_suffix(".part"), {"row": json.dumps(row)})
+    path.with_suffix(".part").replace(path)
+
+
+def measured(results: Path, known: dict[str, Run], address: str) -> dict[str, Any]:
+    """The figures of all finished runs on the test objects. ValueError for a run on other data or of another kind."""
     data = GraspDataModule(address)
     labels = {source: found for source in SOURCES if (found := read_labels(data, "test", source))}
     replicates: dict[str, dict[str, Replicates]] = {}
     rows: dict[str, Any] = {}
-    for name in [name for name in known if finished(folder / name)]:
-        model = dexzoo.load(folder / name)
-        rows[name] = described(folder / name, known[name], model, data)
-        replicates[name] = {source: replicated(model, data, truth, source) for source, truth in labels.items()}
-        rows[name]["figures"] = {source: with_intervals(found) for source, found in replicates[name].items()}
+    for name in [name for name in known if result(results, name).exists()]:
+        with safe_open(result(results, name), "pt") as file:
+            row = json.loads(file.metadata()["row"])
+            logits = {source: file.get_tensor(source) for source in labels}
+        config = row["config"]
+        grasps_seen = config["trainer"]["max_steps"] * config["data"]["batch_size"]
+        if row["data"] != data.source.sha256:
+            raise ValueError(f"{result(results, name)} is of another grasp set than {data.folder}; run it anew")
+        if config != configuration(known[name], config["data"]["folder"], grasps_seen):
+            raise ValueError(f"{result(results, name)} differs from what is asked for now; remove it and run it anew")
+        replicates[name] = {
+            source: replicated(labels[source], logit, torch.sigmoid(logit / row["temperature"] + row["offset"]))
+            for source, logit in logits.items()
+        }
+        rows[name] = {
+            "grasps_seen": grasps_seen,
+            "train_grasps": row["train_grasps"],
+            "validation_auroc": row["validation_auroc"],
+            "figures": {source: with_intervals(found) for source, found in replicates[name].items()},
+        }
     for name, row in rows.items():
         against = known[name].against
         if against in rows:
@@ -166,28 +219,9 @@ def measured(folder: Path, known: dict[str, Run], address: str) -> dict[str, Any
     return {"data": data.source.sha256, "test": sizes, "runs": rows}
 
 
-def described(folder: Path, run: Run, model: GraspEvaluator, data: GraspDataModule) -> dict[str, Any]:
-    """What a run was and what its model takes. ValueError where it was made of other data or in another way."""
-    card = json.loads(next(folder.glob("*.json")).read_text())
-    if card["data"]["sha256"] != data.source.sha256:
-        raise ValueError(f"{folder} was trained on another grasp set than {data.folder}; run it anew")
-    config = yaml.safe_load(asked(folder).read_text())
-    grasps_seen = config["trainer"]["max_steps"] * config["data"]["batch_size"]
-    if config != configuration(run, config["data"]["folder"], grasps_seen):
-        raise ValueError(f"{asked(folder)} differs from what is asked for now; run it anew in another --folder")
-    dataset = data.dataset("test", model, [SOURCES[0]])
-    image, grasps = first_image(data, "test"), dataset.aimed(torch.arange(len(dataset)))
-    return {
-        "grasps_seen": grasps_seen,
-        "train_grasps": card["data"]["train_grasps"],
-        "validation_auroc": card["metrics"]["validation_auroc"],
-        "cost": asdict(measure(model, image, grasps)),
-    }
-
-
-def replicated(model: GraspEvaluator, data: GraspDataModule, labels: Labels, source: str) -> dict[str, Replicates]:
+def replicated(labels: Labels, logit: torch.Tensor, probability: torch.Tensor) -> dict[str, Replicates]:
     """Each figure (1 + draw,), first of the scenes as they are, then of each draw of scenes."""
-    scores = model_scores(model, data.dataset("test", model, [source]), f"{model.architecture} on {source} grasps")
+    scores = Scores(logit.numpy(), 0.5, probability.numpy())
     found = figures(labels, scores, draw_scenes(labels.num_scenes, seed=0))
     return {key: found[key] for key in FIGURES}
 

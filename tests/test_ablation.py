@@ -11,7 +11,6 @@ import pytest
 import synthetic
 import torch
 
-from dexzoo.comparison import scores
 from dexzoo.comparison.compare import compare
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SOURCES
@@ -26,7 +25,6 @@ BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 def ablation(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):  # noqa: ANN201, a module
     monkeypatch.syspath_prepend(BENCHMARKS)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(scores, "NUM_TIMED", 3)
     import ablation
 
     yield ablation
@@ -91,7 +89,9 @@ def test_runs_go_on_are_not_repeated_and_are_measured_as_compare_does(
         with pytest.raises(ValueError, match=r"em2@50\.yaml differs from what is asked for"):
             ablation.fit(folder / "em2@50", known["em2@50"], grasps, 5 * 64)
 
-    result = ablation.measured(folder, known, grasps)
+    for name in known:
+        ablation.keep(folder / name, tmp_path / "results", grasps)
+    result = ablation.measured(tmp_path / "results", known, grasps)
     assert [row["train_grasps"] for row in result["runs"].values()] == [160, 80]
     data = GraspDataModule(grasps)
     reference = compare({name: load(folder / name) for name in known}, data)["sources"]["generated"]["rows"]
@@ -117,4 +117,10 @@ def test_a_run_on_other_data_is_refused(ablation: Any, tmp_path: Path) -> None: 
     known = {"one": ablation.Run("em2_lite.yaml", {"model.width": 8})}
     ablation.fit(tmp_path / "runs" / "one", known["one"], str(grasps), 64)
     with pytest.raises(ValueError, match="was trained on another grasp set"):
-        ablation.measured(tmp_path / "runs", known, os.fspath(others))
+        ablation.keep(tmp_path / "runs" / "one", tmp_path / "results", os.fspath(others))
+    ablation.keep(tmp_path / "runs" / "one", tmp_path / "results", os.fspath(grasps))
+    with pytest.raises(ValueError, match="is of another grasp set"):
+        ablation.measured(tmp_path / "results", known, os.fspath(others))
+    other = {"one": ablation.Run("em2_lite.yaml", {"model.width": 16})}
+    with pytest.raises(ValueError, match="differs from what is asked for now"):
+        ablation.measured(tmp_path / "results", other, os.fspath(grasps))
