@@ -232,13 +232,18 @@ def test_collect_makes_a_set_and_goes_on(run: Run, tmp_path: Path, monkeypatch: 
     assert "was made with seed 0, not 1" in err
 
 
-def test_models_are_listed(run: Run) -> None:
+def test_models_are_listed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     status, out, err = run("models", "--json")
     assert (status, err) == (0, "")
-    assert [row["name"] for row in json.loads(out)["models"]] == list_models()
+    rows = json.loads(out)["models"]
+    assert [row["name"] for row in rows] == list_models()
+    assert all(row["shipped"] for row in rows)
     status, out, err = run("models")
     assert (status, err) == (0, "")
     assert all(name in out for name in list_models())
+    monkeypatch.setattr(commands, "shipped_card", lambda name: None)
+    status, out, err = run("models")
+    assert (status, err) == (0, "")
     assert how_to_get("em3") in " ".join(out.split())
 
 

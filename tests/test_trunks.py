@@ -77,10 +77,6 @@ def test_weights_that_cannot_be_had_are_named(monkeypatch: pytest.MonkeyPatch, t
     monkeypatch.setattr(trunks, "resource", lambda name: tmp_path)
     with pytest.raises(FileNotFoundError, match=r"trunk weights .*vgg16_hed\.safetensors are missing; use another"):
         trunks.load_trunk("hed")
-    with pytest.raises(
-        FileNotFoundError, match=r"resnet50_views\.safetensors are missing; .* make .*train_resnet50\.py`$"
-    ):
-        trunks.load_trunk("resnet50_views")
 
     def offline(*_: object, **__: object) -> None:
         raise OSError("no network")

@@ -85,15 +85,12 @@ def efficientnet_lite0() -> nn.Module:
 
 
 _SCALE = "@scale"
-_MADE_HERE = {"resnet50_views": "assets/checkpoints/train_resnet50.py"}
-"""Files that do not come with dexzoo, and what makes them."""
 
 
 def _shipped(name: str) -> dict[str, Tensor]:
     path = resource("checkpoints") / f"{name}.safetensors"
     if not path.is_file():
-        remedy = f"make them by `python {_MADE_HERE[name]}`" if name in _MADE_HERE else "reinstall dexzoo"
-        raise FileNotFoundError(f"trunk weights {path} are missing; use another trunk, or {remedy}")
+        raise FileNotFoundError(f"trunk weights {path} are missing; use another trunk, or reinstall dexzoo")
     stored = load_file(path)
     scales = {name: stored.pop(name + _SCALE) for name in list(stored) if name + _SCALE in stored}
     return {name: value.float() * scales[name] if name in scales else value for name, value in stored.items()}
@@ -133,7 +130,7 @@ TRUNKS = {
 }
 """hed: VGG-16, ImageNet weights fine-tuned for edge detection (Xie and Tu 2015). imagenet: VGG-16, fetched by
 torchvision. lite0: EfficientNet-lite0, ImageNet. resnet50: ImageNet, fetched by torchvision. resnet50_views: ResNet-50
-trained on rendered views by assets/checkpoints/train_resnet50.py. All but the fetched and the last come with dexzoo."""
+trained on rendered views by assets/checkpoints/train_resnet50.py. All but the fetched come with dexzoo."""
 
 
 def trunk(name: str) -> Trunk:
@@ -146,7 +143,7 @@ def trunk(name: str) -> Trunk:
 def trunk_card(name: str) -> dict[str, Any] | None:
     """What the card of a trunk that comes with dexzoo says, such as source and licence; None for one that is fetched.
 
-    Raises ValueError for another name, FileNotFoundError for one that does not come yet.
+    Raises ValueError for another name, FileNotFoundError where its file is missing.
     """
     file = trunk(name).weights
     if not isinstance(file, str):

@@ -99,8 +99,7 @@ def how_to_get(name: str) -> str:
     """What to do for weights of a name of `list_models` that comes without."""
     ours = f"{name}-adamw.yaml"
     config = ours if (resource("configs") / ours).is_file() else f"{name}.yaml"
-    first = "make its trunk by `python assets/checkpoints/train_resnet50.py`, then " if name == "em3" else ""
-    return f"{first}train them with `python -m dexzoo fit --config {config}` and load the run's folder"
+    return f"train them with `python -m dexzoo fit --config {config}` and load the run's folder"
 
 
 def _only_weights(folder: Path) -> Path:
