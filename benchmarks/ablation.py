@@ -90,18 +90,28 @@ def main() -> None:
         for name in known:
             sys.stdout.write(f"{name:16} {'finished' if result(options.results, name).exists() else ''}\n")
         return
-    for name in [] if options.done else options.runs:
-        if not result(options.results, name).exists():
-            fit(options.folder / name, known[name], options.data, options.grasps)
-            keep(options.folder / name, options.results, options.data)
     if options.done:
         figures_of_all = measured(options.results, known, options.data)
         options.results.with_suffix(".json").write_text(json.dumps(figures_of_all, indent=2, allow_nan=False) + "\n")
+        return
+    for name in options.runs:
+        path = result(options.results, name)
+        if not path.exists():
+            fit(options.folder / name, known[name], options.data, options.grasps)
+            keep(options.folder / name, options.results, options.data)
+        elif read(path)[0]["config"] != configuration(known[name], options.data, options.grasps):
+            parser.error(f"{path} differs from what is asked for; go on with the same options or give other --results")
 
 
 def result(results: Path, name: str) -> Path:
     """The file of a finished run."""
     return results / f"{name}.safetensors"
+
+
+def read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """What the run of such a file was, and its log-odds by source."""
+    with safe_open(path, "pt") as file:
+        return json.loads(file.metadata()["row"]), {source: file.get_tensor(source) for source in file.keys()}  # noqa: SIM118
 
 
 def finished(folder: Path) -> bool:
@@ -188,9 +198,7 @@ def measured(results: Path, known: dict[str, Run], address: str) -> dict[str, An
     replicates: dict[str, dict[str, Replicates]] = {}
     rows: dict[str, Any] = {}
     for name in [name for name in known if result(results, name).exists()]:
-        with safe_open(result(results, name), "pt") as file:
-            row = json.loads(file.metadata()["row"])
-            logits = {source: file.get_tensor(source) for source in labels}
+        row, logits = read(result(results, name))
         config = row["config"]
         grasps_seen = config["trainer"]["max_steps"] * config["data"]["batch_size"]
         if row["data"] != data.source.sha256:

@@ -565,6 +565,7 @@ def test_names_and_places_that_do_not_exist(tmp_path: Path, monkeypatch: pytest.
     for name, how in (
         ("em1", r"train them with .*--config em1-adamw\.yaml"),
         ("ffh", r"train them with .*--config ffh\.yaml"),
+        ("em3", r"train them with .*--config em3\.yaml"),
     ):
         with pytest.raises(FileNotFoundError, match=f"model {name} comes without weights; {how}"):
             zoo.load(name)
