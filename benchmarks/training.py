@@ -23,7 +23,7 @@ import dexzoo
 from dexzoo.comparison.scores import processor
 from dexzoo.data.datamodule import Draw, GraspDataModule
 from dexzoo.models.em2 import EM2
-from dexzoo.models.encoders import has_bfloat16
+from dexzoo.models.encoders import fast_bfloat16
 from dexzoo.models.evaluator import CHUNK, Batch
 
 KEPT_STEPS, TRUNK_STEPS = 16, 2
@@ -63,7 +63,7 @@ def training(data: GraspDataModule) -> dict[str, Any]:
     batches = list(data.loader(features, balanced=True).sampler)
 
     def step(batch: Batch) -> None:
-        with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16(torch.device("cpu"))):
+        with torch.autocast("cpu", torch.bfloat16, enabled=fast_bfloat16(torch.device("cpu"))):
             loss = F.binary_cross_entropy_with_logits(model.batch_logit(batch), batch.success)
         optimizer.zero_grad()
         loss.backward()

@@ -23,7 +23,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from dexzoo.data.datamodule import GraspDataModule
-from dexzoo.models.encoders import has_bfloat16
+from dexzoo.models.encoders import fast_bfloat16
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load, load_weights
 from dexzoo.resources import resource
@@ -85,8 +85,8 @@ class CommandLine(LightningCLI):
         trainer = self._get(self.config, "trainer")
         chosen = trainer.accelerator
         on_processor = chosen == "cpu" or (chosen == "auto" and not torch.accelerator.is_available())
-        if on_processor and trainer.precision == "bf16-mixed" and not has_bfloat16(torch.device("cpu")):
-            _log.warning("this processor has no instructions for bfloat16: precision 32-true in place of it")
+        if on_processor and trainer.precision == "bf16-mixed" and not fast_bfloat16(torch.device("cpu")):
+            _log.warning("bfloat16 is slower than float32 on this processor: precision 32-true in place of it")
             trainer.precision = "32-true"
 
     def _parse_ckpt_path(self) -> None:

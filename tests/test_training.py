@@ -120,14 +120,14 @@ def drawn_from(success: torch.Tensor, scene: torch.Tensor) -> GraspDataset:
 
 
 @pytest.mark.parametrize(("has", "precision"), [(True, "bf16-mixed"), (False, "32-true")])
-def test_bfloat16_only_where_the_processor_has_it(
+def test_bfloat16_only_where_it_is_fast(
     arguments: list[str],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     has: bool,
     precision: str,
 ) -> None:
-    monkeypatch.setattr(training, "has_bfloat16", lambda device: has)
+    monkeypatch.setattr(training, "fast_bfloat16", lambda device: has)
     run = fit([*arguments, "--trainer.max_steps=1", "--trainer.val_check_interval=1"], capsys)
     card = json.loads((run / "em2.json").read_text())
     assert card["config"]["trainer"]["precision"] == precision

@@ -16,6 +16,7 @@ from dexzoo.models import trunks
 from dexzoo.models.em1 import EM1
 from dexzoo.models.em2 import EM2
 from dexzoo.models.em3 import EM3
+from dexzoo.models.encoders import fast_bfloat16
 from dexzoo.resources import resource
 
 SHIPPED = {"hed": ("vgg16_hed", 14_714_688), "lite0": ("efficientnet_lite0", 3_350_000)}
@@ -46,6 +47,22 @@ def test_a_trunk_is_frozen_and_converted_right(name: str, size: int, scale: floa
     largest = float(features.max())
     torch.testing.assert_close(features[golden["channels"]], expected, atol=5e-3 * largest, rtol=0)
     assert float(features.mean()) == pytest.approx(golden["mean"], rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("abilities", "fast"),
+    [
+        ({"cpu_name": "AMD EPYC"}, False),
+        ({"cpu_name": "AMD EPYC", "avx512_bf16": True}, True),
+        ({"cpu_name": "Intel Xeon", "avx512_bf16": True, "amx_bf16": False}, False),
+        ({"cpu_name": "Intel Xeon", "avx512_bf16": True, "amx_bf16": True}, True),
+        ({"cpu_name": "Neoverse V1", "bf16": True}, True),
+    ],
+)
+def test_where_bfloat16_is_fast(monkeypatch: pytest.MonkeyPatch, abilities: dict[str, object], fast: bool) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: abilities)
+    assert fast_bfloat16(torch.device("cpu")) is fast
+    assert fast_bfloat16(torch.device("cuda"))
 
 
 @pytest.mark.parametrize("name", trunks.TRUNKS)

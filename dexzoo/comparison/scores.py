@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dexzoo.data.datamodule import GraspDataModule, GraspDataset
 from dexzoo.data.schema import SPLITS
-from dexzoo.models.encoders import DepthEncoder, has_bfloat16
+from dexzoo.models.encoders import DepthEncoder, fast_bfloat16
 from dexzoo.models.evaluator import CHUNK, GraspEvaluator, Scene
 from dexzoo.models.trunks import trunk_bytes
 
@@ -199,9 +199,9 @@ def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: 
 
 
 def processor() -> str:
-    """This machine's, and whether it has instructions for bfloat16."""
+    """This machine's, and whether it is fast in bfloat16."""
     name = torch.cpu.get_capabilities()["cpu_name"]
-    return f"{name}, {'with' if has_bfloat16(torch.device('cpu')) else 'without'} bfloat16"
+    return f"{name}, {'with' if fast_bfloat16(torch.device('cpu')) else 'without'} fast bfloat16"
 
 
 def _best_time(work: Callable[[], object]) -> float:
