@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import synthetic
 import torch
@@ -15,6 +16,7 @@ import yaml
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.plugins.precision import MixedPrecision
 from safetensors.torch import load_file
+from sklearn.preprocessing import scale
 
 from dexzoo import training
 from dexzoo.camera import Observation
@@ -272,6 +274,19 @@ def test_inputs_are_standardised_and_constant_ones_survive(data: GraspDataModule
     torch.testing.assert_close(vector.mean(0), torch.zeros(280), atol=1e-4, rtol=0)
     torch.testing.assert_close(vector[:, varied].std(0), torch.ones(int(varied.sum())), atol=1e-3, rtol=0)
     assert (vector[:, 10].abs() < 1e-5).all()
+
+
+def test_features_of_a_trunk_are_standardised_over_training_views(data: GraspDataModule) -> None:
+    torch.manual_seed(0)
+    images = data.source.images(range(4))[torch.arange(4)]
+    model = EM2(width=16, standardise=True).eval()
+    model.fit_statistics(images, data.waypoints)
+    features, grasps = model.encode(images)["features"], data.waypoints[:4, None]
+    found = model.logit({"features": features}, grasps)
+    plain = EM2(width=16).eval()
+    plain.load_state_dict({name: value for name, value in model.state_dict().items() if "feature_" not in name})
+    z = torch.from_numpy(scale(features.numpy().astype(np.float64))) * (3 / 4) ** 0.5
+    torch.testing.assert_close(found, plain.logit({"features": z.float().clamp(-3, 3)}, grasps), atol=1e-3, rtol=1e-3)
 
 
 def test_gradients_can_be_clipped_where_precision_is_mixed() -> None:

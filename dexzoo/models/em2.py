@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dexzoo.models.encoders import DepthEncoder, GraspVector, dense, initialise
+from dexzoo.models.encoders import CLIP, MIN_STD, DepthEncoder, GraspVector, dense, initialise
 from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
 
 BLOCKS = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
@@ -26,10 +26,14 @@ class EM2(GraspEvaluator):
     trunk: the thesis' VGG-16, "hed" (shipped) or "imagenet" (fetched), or another of `trunks.TRUNKS`.
     dropout: probability of dropping a unit.
     gain: of Xavier's weights; the root of 2 keeps the variance through ReLUs, which 1, the thesis', does not.
+    standardise: whether the trunk's features are standardised, channel by channel, over training views. The thesis
+        does not; but averaged over an image that is mostly background they hardly differ from view to view.
     The other arguments are `GraspEvaluator`'s.
     """
 
     architecture: ClassVar[str] = "em2"
+    feature_mean: Tensor
+    feature_std: Tensor
     frozen_encoder: ClassVar[bool] = True
 
     def __init__(
@@ -38,12 +42,17 @@ class EM2(GraspEvaluator):
         trunk: str = "hed",
         dropout: float = 0.5,
         gain: float = 1.0,
+        standardise: bool = False,
         **training: Unpack[TrainingOptions],
     ) -> None:
         super().__init__(**training)
         self.width, self.trunk, self.dropout, self.gain = width, trunk, dropout, gain
+        self.standardise = standardise
         self.image_encoder = DepthEncoder(trunk)
         self.grasp_vector = GraspVector()
+        if standardise:
+            self.register_buffer("feature_mean", torch.zeros(self.image_encoder.channels))
+            self.register_buffer("feature_std", torch.ones(self.image_encoder.channels))
         layers: list[nn.Module] = []
         channels = 1
         for block, (size, count) in enumerate(BLOCKS):
@@ -59,9 +68,13 @@ class EM2(GraspEvaluator):
         initialise(self, gain)
 
     def fit_statistics(self, images: Float[Tensor, "view 2 224 224"], waypoints: Float[Tensor, "grasp 10 28"]) -> None:
-        """Set the standardisation of both inputs from training data."""
+        """Set the standardisation of both inputs, and of the trunk's features, from training data."""
         self.image_encoder.fit_statistics(images)
         self.grasp_vector.fit_statistics(waypoints)
+        if self.standardise:
+            features = torch.cat([self.encode(part)["features"] for part in images.split(16)])
+            self.feature_mean.copy_(features.mean(0))
+            self.feature_std.copy_(features.std(0).clamp_min(MIN_STD))
 
     def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
         """The trunk's features, averaged over the image: (view, channel), 512 of them with VGG-16."""
@@ -72,7 +85,10 @@ class EM2(GraspEvaluator):
         views, count = grasps.shape[:2]
         vector = self.grasp_vector(grasps).flatten(0, 1)
         hand = self.hand_branch(vector[:, None]).unflatten(0, (views, count))
-        image = scene["features"].to(hand)[:, None].expand(-1, count, -1)
+        features = scene["features"].to(hand)
+        if self.standardise:
+            features = ((features - self.feature_mean) / self.feature_std).clamp(-CLIP, CLIP)
+        image = features[:, None].expand(-1, count, -1)
         fail, success = self.head(torch.cat((image, hand), dim=-1)).unbind(-1)
         log_odds: Tensor = success - fail
         return log_odds
