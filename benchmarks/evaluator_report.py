@@ -193,22 +193,22 @@ def ablation(found: dict[str, Any]) -> str:
 
 def account(runs: dict[str, Any]) -> list[str]:
     """Why em1 and em2 stay below the thesis' figures; nothing before the learning curve of one has been run."""
-    section = read("comparison")["sources"][GENERATED]
-    curves = []
-    for name in ("em1", "em2"):
-        curve = [runs[run] for run in (f"{name}@10", f"{name}@30", name) if run in runs]
-        card = shipped_card(name)
-        if len(curve) == 3 and card:
-            few, _, all_scenes = values = [row["figures"][GENERATED]["auroc"]["value"] for row in curve]
-            shipped, longer = section["rows"][name]["figures"]["auroc"]["value"], card["grasps_seen"]
-            curves.append(
-                f"of `{name}` is {', '.join(f'{value:.3f}' for value in values)}, so that ten times the scenes bring "
-                f"{all_scenes - few:+.3f}; that of its shipped weights, which saw {longer:,} grasps in place of "
-                f"{curve[-1]['grasps_seen']:,}, refined ones among them, is {shipped:.3f}, {shipped - all_scenes:+.3f}"
-            )
+    curves = {name: (f"{name}@10", f"{name}@30", name) for name in ("em1", "em2")}
+    curves = {name: curve for name, curve in curves.items() if set(curve) <= set(runs)}
     if not curves:
         return []
+    section = read("comparison")["sources"][GENERATED]
     once = read("repeated")["rows"]["its one trial without disturbance"]
+    told = []
+    for name, curve in curves.items():
+        values = [runs[run]["figures"][GENERATED]["auroc"]["value"] for run in curve]
+        shipped, card = section["rows"][name]["figures"]["auroc"]["value"], shipped_card(name) or {}
+        told.append(
+            f"of `{name}` is {', '.join(f'{value:.3f}' for value in values)}, so that ten times the scenes bring "
+            f"{values[-1] - values[0]:+.3f}; that of its shipped weights, which saw {card['grasps_seen']:,} grasps in "
+            f"place of {runs[name]['grasps_seen']:,}, refined ones among them, is {shipped:.3f}, "
+            f"{shipped - values[-1]:+.3f}"
+        )
     gm, best = (section["rows"][name]["figures"] for name in ("gm", "em_fk"))
     return [
         "Why `em1` and `em2` stay below the thesis' figures. The grasps are harder to tell apart: the generator's own "
@@ -216,7 +216,7 @@ def account(runs: dict[str, Any]) -> list[str]:
         f"thesis in {percent(THESIS['gm']['top1'])}. The labels are not what limits: one trial foretells another of "
         f"the same grasp in {percent(once['accuracy']['value'])}, `em_fk` is right in "
         f"{percent(best['accuracy']['value'])}. With 10, 30 and 100 % of the training scenes the AUROC "
-        f"{'; '.join(curves)}. The thesis trained on 20,025 scenes with 1,081,332 grasps, and saw each some 18 times: "
+        f"{'; '.join(told)}. The thesis trained on 20,025 scenes with 1,081,332 grasps, and saw each some 18 times: "
         "the length of training limits more here than the number of scenes.\n"
     ]
 
