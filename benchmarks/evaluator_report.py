@@ -199,7 +199,7 @@ def account(runs: dict[str, Any]) -> list[str]:
         return []
     section = read("comparison")["sources"][GENERATED]
     once = read("repeated")["rows"]["its one trial without disturbance"]
-    told = []
+    told, longer_helps_more = [], True
     for name, curve in curves.items():
         values = [runs[run]["figures"][GENERATED]["auroc"]["value"] for run in curve]
         shipped, card = section["rows"][name]["figures"]["auroc"]["value"], shipped_card(name) or {}
@@ -209,6 +209,12 @@ def account(runs: dict[str, Any]) -> list[str]:
             f"place of {runs[name]['grasps_seen']:,}, refined ones among them, is {shipped:.3f}, "
             f"{shipped - values[-1]:+.3f}"
         )
+        longer_helps_more &= shipped - values[-1] > values[-1] - values[0]
+    limit = (
+        "the length of training limits more here than the number of scenes"
+        if longer_helps_more
+        else "the number of scenes limits at least as much here as the length of training"
+    )
     gm, best = (section["rows"][name]["figures"] for name in ("gm", "em_fk"))
     return [
         "Why `em1` and `em2` stay below the thesis' figures. The grasps are harder to tell apart: the generator's own "
@@ -217,7 +223,7 @@ def account(runs: dict[str, Any]) -> list[str]:
         f"the same grasp in {percent(once['accuracy']['value'])}, `em_fk` is right in "
         f"{percent(best['accuracy']['value'])}. With 10, 30 and 100 % of the training scenes the AUROC "
         f"{'; '.join(told)}. The thesis trained on 20,025 scenes with 1,081,332 grasps, and saw each some 18 times: "
-        "the length of training limits more here than the number of scenes.\n"
+        f"{limit}.\n"
     ]
 
 
