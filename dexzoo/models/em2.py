@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dexzoo.models.encoders import CLIP, MIN_STD, DepthEncoder, GraspVector, dense, initialise
+from dexzoo.models.encoders import CLIP, DepthEncoder, GraspVector, Standardisation, dense, initialise
 from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
 
 BLOCKS = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
@@ -32,8 +32,6 @@ class EM2(GraspEvaluator):
     """
 
     architecture: ClassVar[str] = "em2"
-    feature_mean: Tensor
-    feature_std: Tensor
     frozen_encoder: ClassVar[bool] = True
 
     def __init__(
@@ -51,8 +49,7 @@ class EM2(GraspEvaluator):
         self.image_encoder = DepthEncoder(trunk)
         self.grasp_vector = GraspVector()
         if standardise:
-            self.register_buffer("feature_mean", torch.zeros(self.image_encoder.channels))
-            self.register_buffer("feature_std", torch.ones(self.image_encoder.channels))
+            self.features = Standardisation(self.image_encoder.channels, CLIP)
         layers: list[nn.Module] = []
         channels = 1
         for block, (size, count) in enumerate(BLOCKS):
@@ -72,9 +69,7 @@ class EM2(GraspEvaluator):
         self.image_encoder.fit_statistics(images)
         self.grasp_vector.fit_statistics(waypoints)
         if self.standardise:
-            features = torch.cat([self.encode(part)["features"] for part in images.split(16)])
-            self.feature_mean.copy_(features.mean(0))
-            self.feature_std.copy_(features.std(0).clamp_min(MIN_STD))
+            self.features.fit(torch.cat([self.encode(part)["features"] for part in images.split(16)]))
 
     def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
         """The trunk's features, averaged over the image: (view, channel), 512 of them with VGG-16."""
@@ -87,7 +82,7 @@ class EM2(GraspEvaluator):
         hand = self.hand_branch(vector[:, None]).unflatten(0, (views, count))
         features = scene["features"].to(hand)
         if self.standardise:
-            features = ((features - self.feature_mean) / self.feature_std).clamp(-CLIP, CLIP)
+            features = self.features.standardise(features)
         image = features[:, None].expand(-1, count, -1)
         fail, success = self.head(torch.cat((image, hand), dim=-1)).unbind(-1)
         log_odds: Tensor = success - fail

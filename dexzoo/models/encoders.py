@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -30,7 +32,33 @@ def fast_bfloat16(device: torch.device) -> bool:
     return bool(by_vector or abilities.get("amx_bf16") or abilities.get("bf16"))
 
 
-class DepthEncoder(nn.Module):
+class Standardisation(nn.Module):
+    """Numbers less their mean and divided by their deviation, over training data, index by index along the last axis.
+
+    An index that does not vary in the training data is only shifted. limit: what is further from 0 is clipped.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, size: int, limit: float = math.inf) -> None:
+        super().__init__()
+        self.limit = limit
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("std", torch.ones(size))
+
+    def fit(self, x: Float[Tensor, "sample index"]) -> None:
+        """Set mean and standard deviation."""
+        std = x.double().std(0)
+        self.mean.copy_(x.double().mean(0))
+        self.std.copy_(torch.where(std > MIN_STD, std, 1.0))
+
+    def standardise(self, x: Float[Tensor, "*batch index"]) -> Float[Tensor, "*batch index"]:
+        """The standardised numbers."""
+        return ((x - self.mean) / self.std).clamp(-self.limit, self.limit)
+
+
+class DepthEncoder(Standardisation):
     """Depth image -> feature map of a frozen trunk (`dexzoo.models.trunks`), in bfloat16 where that is fast.
 
     The colourised depth is standardised by channel, with mean and standard deviation over the object pixels of the
@@ -43,62 +71,45 @@ class DepthEncoder(nn.Module):
     channels: of the feature map.
     """
 
-    mean: Tensor
-    std: Tensor
-
     def __init__(self, name: str = "hed") -> None:
-        super().__init__()
+        super().__init__(3, CLIP)
         self.name = name
         self.channels = trunk(name).channels
-        self.register_buffer("mean", torch.tensor([0.57, 0.0, 0.0]))
-        self.register_buffer("std", torch.tensor([0.1, 0.03, 0.03]))
+        self.mean.copy_(torch.tensor([0.57, 0.0, 0.0]))
+        self.std.copy_(torch.tensor([0.1, 0.03, 0.03]))
 
     def fit_statistics(self, images: Float[Tensor, "view 2 224 224"]) -> None:
         """Set mean and standard deviation from training views."""
         channels = colourise(images[:, 0])
-        pixels = channels.movedim(1, -1)[images[:, 0] > 0].double()
+        pixels = channels.movedim(1, -1)[images[:, 0] > 0]
         if not len(pixels):
             raise ValueError("the training views show no object: all depths are 0")
-        self.mean.copy_(pixels.mean(0))
-        self.std.copy_(pixels.std(0).clamp_min(MIN_STD))
-
-    def standardise(self, images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view 3 224 224"]:
-        """The colourised depth, standardised and clipped."""
-        x = (colourise(images[:, 0].float()) - self.mean[:, None, None].float()) / self.std[:, None, None].float()
-        return x.clamp(-CLIP, CLIP)
+        self.fit(pixels)
 
     @torch.no_grad()
     def forward(self, images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view channel row column"]:
         """The last convolution's features, after its ReLU and before the last pooling."""
         network = load_trunk(self.name).to(images.device)
         scale = trunk(self.name).scale
-        x = (scale * self.standardise(images)).contiguous(memory_format=torch.channels_last)
+        standard = self.standardise(colourise(images[:, 0].float()).movedim(1, -1)).movedim(-1, 1)
+        x = (scale * standard).contiguous(memory_format=torch.channels_last)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=fast_bfloat16(images.device)):
             features: Tensor = network(x)
         return (features.float() / scale).contiguous()
 
 
-class GraspVector(nn.Module):
+class GraspVector(Standardisation):
     """A grasp as 280 numbers: the type as one of ten, then 27 for each waypoint, standardised index by index.
 
-    The 27 are position, quaternion (wxyz, w >= 0) and the 20 joints. An index that does not vary in the training data
-    is only shifted.
+    The 27 are position, quaternion (wxyz, w >= 0) and the 20 joints.
     """
 
-    mean: Tensor
-    std: Tensor
-
     def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(VECTOR_SIZE))
-        self.register_buffer("std", torch.ones(VECTOR_SIZE))
+        super().__init__(VECTOR_SIZE)
 
     def fit_statistics(self, waypoints: Float[Tensor, "grasp 10 28"]) -> None:
         """Set mean and standard deviation from training grasps in the camera frame."""
-        vectors = self.flatten(waypoints).double()
-        std = vectors.std(0)
-        self.mean.copy_(vectors.mean(0))
-        self.std.copy_(torch.where(std > MIN_STD, std, 1.0))
+        self.fit(self.flatten(waypoints))
 
     @staticmethod
     def flatten(waypoints: Float[Tensor, "*batch 10 28"]) -> Float[Tensor, "*batch 280"]:
@@ -110,7 +121,7 @@ class GraspVector(nn.Module):
 
     def forward(self, waypoints: Float[Tensor, "*batch 10 28"]) -> Float[Tensor, "*batch 280"]:
         """The 280 standardised numbers."""
-        return (self.flatten(waypoints) - self.mean) / self.std
+        return self.standardise(self.flatten(waypoints))
 
 
 def initialise(module: nn.Module, gain: float = 1.0) -> None:
