@@ -30,7 +30,7 @@ KEPT_STEPS, TRUNK_STEPS = 16, 2
 NUM_VIEWS = 16
 NUM_GRASPS, NUM_PAIRS = 1000, 24
 NUM_SCENES = 8
-"""Of training; how many there are is nothing to the time of a step."""
+"""Training scenes: the time of a step does not depend on how many there are."""
 
 
 def main() -> None:
