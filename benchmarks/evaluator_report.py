@@ -207,9 +207,11 @@ def ingredients(runs: dict[str, Any]) -> list[str]:
 
     if not changes:
         return []
+    other = runs.get("em_fk+seed")
+    chance = f" Another seed alone changes it by {other['change'][GENERATED]['auroc']['value']:+.3f}." if other else ""
     return [
         f"The AUROC of `em_fk` falls by more than the scenes' chance without {told(True)}; in training of this length "
-        f"it does not without {told(False)}.\n"
+        f"it does not without {told(False)}.{chance}\n"
     ]
 
 
