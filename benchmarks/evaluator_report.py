@@ -223,20 +223,20 @@ def account(runs: dict[str, Any]) -> list[str]:
         return []
     section = read("comparison")["sources"][GENERATED]
     once = read("repeated")["rows"]["its one trial without disturbance"]
-    told, longer_helps_more = [], True
+    told, gains = [], []
     for name, curve in curves.items():
         values = [runs[run]["figures"][GENERATED]["auroc"]["value"] for run in curve]
         shipped, card = section["rows"][name]["figures"]["auroc"]["value"], shipped_card(name) or {}
+        by_scenes, by_length = values[-1] - values[0], shipped - values[-1]
+        gains.append((by_scenes, by_length))
         told.append(
             f"of `{name}` is {', '.join(f'{value:.3f}' for value in values)}, so that ten times the scenes bring "
-            f"{values[-1] - values[0]:+.3f}; that of its shipped weights, which saw {card['grasps_seen']:,} grasps in "
-            f"place of {runs[name]['grasps_seen']:,}, refined ones among them, is {shipped:.3f}, "
-            f"{shipped - values[-1]:+.3f}"
+            f"{by_scenes:+.3f}; that of its shipped weights, which saw {card['grasps_seen']:,} grasps in "
+            f"place of {runs[name]['grasps_seen']:,}, refined ones among them, is {shipped:.3f}, {by_length:+.3f}"
         )
-        longer_helps_more &= shipped - values[-1] > values[-1] - values[0]
     limit = (
         "the length of training limits more here than the number of scenes"
-        if longer_helps_more
+        if all(by_length > by_scenes for by_scenes, by_length in gains)
         else "the number of scenes limits at least as much here as the length of training"
     )
     gm, best = (section["rows"][name]["figures"] for name in ("gm", "em_fk"))

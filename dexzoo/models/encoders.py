@@ -49,8 +49,9 @@ class Standardisation(nn.Module):
 
     def fit(self, x: Float[Tensor, "sample index"]) -> None:
         """Set mean and standard deviation."""
-        std = x.double().std(0)
-        self.mean.copy_(x.double().mean(0))
+        x = x.double()
+        std = x.std(0)
+        self.mean.copy_(x.mean(0))
         self.std.copy_(torch.where(std > MIN_STD, std, 1.0))
 
     def standardise(self, x: Float[Tensor, "*batch index"]) -> Float[Tensor, "*batch index"]:
