@@ -26,12 +26,13 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 import dexzoo
-from dexzoo import training
+from dexzoo.collection.rendering import render
 from dexzoo.comparison.figures import draw_scenes, figures, with_interval
 from dexzoo.comparison.scores import Labels, Scores, model_scores, read_labels
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SOURCES
 from dexzoo.resources import resource
+from dexzoo.training import command_line
 
 NUM_VALIDATIONS = 10
 REFINED = "refined"
@@ -57,7 +58,7 @@ def runs() -> dict[str, Run]:
     base = {"data.sources": [source for source in SOURCES if source != REFINED]}
     whole = {"em_fk": "em_fk.yaml", "em2": "em2-adamw.yaml", "em1": "em1-adamw.yaml"}
     known = {name: Run(config, base) for name, config in whole.items()}
-    for part in ("image", "depth", "cloud", "table", "way", "attention"):
+    for part in ("image", "depth", "cloud", "table", "motion", "attention"):
         known[f"em_fk-{part}"] = Run("em_fk.yaml", base | {f"model.{part}": False}, "em_fk")
     known["em_fk-perturbed"] = Run("em_fk.yaml", {"data.sources": SOURCES[:1]}, "em_fk")
     for share in (10, 30):
@@ -139,7 +140,7 @@ def fit(folder: Path, run: Run, data: str, grasps: int) -> None:
         file.write_text(text)
     place = {"save_dir": folder.parent, "name": "", "version": folder.name}
     logger = [f"--trainer.logger.init_args.{name}={value}" for name, value in place.items()]
-    training.main(["fit", "--config", str(file), *logger, *resumed])
+    command_line.main(["fit", "--config", str(file), *logger, *resumed])
 
 
 def configuration(run: Run, data: str, grasps: int) -> dict[str, Any]:
@@ -162,12 +163,19 @@ def configuration(run: Run, data: str, grasps: int) -> dict[str, Any]:
     return config
 
 
+def opened(address: str) -> GraspDataModule:
+    """A grasp set whose views are rendered where it keeps no images."""
+    data = GraspDataModule(address)
+    data.renderer = render
+    return data
+
+
 def keep(folder: Path, results: Path, address: str) -> None:
     """Write what a run was, and its log-odds on the test grasps of each source, into the results.
 
     ValueError for a run that saw another grasp set.
     """
-    data = GraspDataModule(address)
+    data = opened(address)
     card = json.loads(next(folder.glob("*.json")).read_text())
     if card["data"]["sha256"] != data.source.sha256:
         raise ValueError(f"{folder} was trained on another grasp set than {data.folder}; run it anew")
@@ -193,7 +201,7 @@ def keep(folder: Path, results: Path, address: str) -> None:
 
 def measured(results: Path, known: dict[str, Run], address: str) -> dict[str, Any]:
     """The figures of all finished runs on the test objects. ValueError for a run on other data or of another kind."""
-    data = GraspDataModule(address)
+    data = opened(address)
     labels = {source: found for source in SOURCES if (found := read_labels(data, "test", source))}
     replicates: dict[str, dict[str, Replicates]] = {}
     rows: dict[str, Any] = {}

@@ -1,8 +1,8 @@
 """Write docs/cards/NAME.md for every model that comes with weights.
 
 python benchmarks/cards.py
-What it is comes from the class, what it was trained on and its limits from assets/checkpoints/NAME.json, what its
-frozen trunk is from the trunk's own card there, its figures from benchmarks/results/comparison.json.
+The description comes from the docstring of the class, training data and limits from assets/checkpoints/NAME.json, the
+frozen trunk from the trunk's own card there, and the figures from benchmarks/results/comparison.json.
 """
 
 import inspect
@@ -12,23 +12,27 @@ from tables import ROOT, read, table
 
 from dexzoo.comparison.report import cost_table, main_table, title
 from dexzoo.comparison.scores import COIN, GM
+from dexzoo.models.registry import list_models, shipped_card
 from dexzoo.models.trunks import trunk_card
-from dexzoo.models.zoo import list_models, load, model_class, shipped_card
+from dexzoo.models.zoo import load, model_class
 
 CARDS = ROOT / "docs" / "cards"
-TRUNK = ("trunk", "source", "licence", "paper", "data", "sha256")
-"""What is told of a trunk, as far as its card has it."""
+TRUNK = ("trunk", "source", "license", "paper", "data", "sha256")
+"""Entries of a trunk's card that are shown, if it has them."""
+SECTIONS = ("Args:", "Attributes:", "Raises:")
+"""Headings that end the description of the model in a class's docstring."""
 USE = """\
 ```python
 evaluator = dexzoo.load("{name}")
-p = evaluator.score(observation, grasps)  # (num_grasps,) probabilities of success
-logit = evaluator.prepare(observation).logit(grasps.to_frame("world", observation.T_world_camera).waypoints)
+p = evaluator.score(grasps, observation)  # (num_grasps,) probabilities of success
+logit = evaluator.prepare(observation).logit(grasps)
 ```
 
-In: one depth image with its camera (`dexzoo.Observation`; the object is segmented and the camera turned to it: 224 x
-224 pixels of depth and of height over the table, metres), and grasps (`dexzoo.Grasps`, (num_grasps, 10, 28): ten
-waypoints of wrist position in metres, quaternion wxyz, 20 joint angles in radians, and a type) in the world frame or
-the camera's. Out: the probability that each grasp holds; `logit` gives log-odds, differentiable in the grasps.
+Input: one depth image with its camera (`dexzoo.Observation`) and grasps (`dexzoo.Grasps`) in the world frame of the
+observation. The object is segmented and the camera is turned to it; the network receives 224 x 224 pixels of depth and
+of height over the table, in meters. A grasp has a type and ten waypoints with the wrist position in meters, the wrist
+quaternion wxyz and 20 joint angles in radians. Output: the probability that each grasp holds. `logit` returns log-odds,
+differentiable in the grasps.
 """
 
 
@@ -48,11 +52,14 @@ def page(name: str) -> str:
     card, found = shipped_card(name), read("comparison")
     assert card is not None
     summary, *rest = (inspect.getdoc(model_class(name)) or "").split("\n\n")
+    # the part before the arguments; if they have no heading, the last paragraph lists them
+    end = next((i for i, paragraph in enumerate(rest) if paragraph.startswith(SECTIONS)), len(rest) - 1)
     parts = [
         f"# {name}\n\n{summary}\n",
-        *(f"{paragraph}\n" for paragraph in rest[:-1]),  # the last one lists the arguments
-        "Written by `benchmarks/cards.py`. How it compares: [results](../results.md). What the columns are: "
-        "[comparing](../comparing.md). Which thesis: [README](../../README.md).\n",
+        *(f"{paragraph}\n" for paragraph in rest[:end]),
+        "`benchmarks/cards.py` writes this card. Comparison with other models: [results](../results.md). Meaning of "
+        "the "
+        'columns: [comparing](../comparing.md). "The thesis" is Zhao 2019, see the [README](../../README.md).\n',
         "## Use\n",
         USE.format(name=name),
         "## Trained on\n",
@@ -75,38 +82,38 @@ def training(card: dict[str, Any]) -> str:
     """Data, run and validation."""
     data = card["data"]
     settings = {f"{part}, {name}": value for part, own in card.get("config", {}).items() for name, value in own.items()}
-    seen = f"{card['grasps_seen']:,}, each time that one was drawn counted"
+    seen = f"{card['grasps_seen']:,}, with repetitions"
     rows = [
         ("grasps", f"{data['train_grasps']:,}"),
-        ("grasps seen", seen if card["grasps_seen"] else "by its members alone; the grasps of validation calibrate it"),
+        ("grasps seen", seen if card["grasps_seen"] else "by its members only; validation grasps calibrate it"),
         ("grasp set", f"format {data['version']}, SHA-256 of its tables `{data['sha256']}`"),
         ("command", f"`{card['command']}`"),
         ("seed", card["seed"]),
         ("validation", listed({name.removeprefix("validation_"): value for name, value in card["metrics"].items()})),
         *((name, value) for name, value in settings.items() if value is not None),
     ]
-    return table(("what", ""), rows)
+    return table(("training", ""), rows)
 
 
 def trunk(arguments: dict[str, Any]) -> list[str]:
-    """What the frozen trunk is, for a model that has one."""
+    """Description of the frozen trunk, for a model that has one."""
     if "trunk" not in arguments:
         return []
     name = arguments["trunk"]
-    card = trunk_card(name) or {"trunk": f"{name}, fetched by torchvision"}
+    card = trunk_card(name) or {"trunk": f"{name}, downloaded by torchvision"}
     rows = [(key, listed(card[key]) if isinstance(card[key], dict) else card[key]) for key in TRUNK if key in card]
     return [
         "## Frozen trunk\n",
-        "It sees the colourised depth image; nothing of it was trained with grasps.\n",
-        table(("what", ""), rows),
+        "Its input is the colorized depth image. No part of it was trained with grasps.\n",
+        table(("entry", ""), rows),
     ]
 
 
 def figures(name: str, found: dict[str, Any]) -> str:
-    """Its rows of the comparison, with gm and the coin beside it; size and speed."""
+    """Rows of the model, gm and the coin in the comparison; size and speed."""
     if name not in found["cost"]:
         return "Not compared yet: `python benchmarks/comparison.py`.\n"
-    parts = ["95 % bootstrap intervals over scenes; p against gm, the generator's own order.\n"]
+    parts = ["Intervals are 95 % bootstrap over scenes; p is against gm, the generator's own order.\n"]
     for source, section in found["sources"].items():
         rows = {label: row for label, row in section["rows"].items() if label in (name, GM, COIN)}
         parts += [f"{title(source, section)}:\n", table(*main_table(section | {"rows": rows}))]
@@ -114,7 +121,7 @@ def figures(name: str, found: dict[str, Any]) -> str:
 
 
 def calibration(name: str) -> str:
-    """How log-odds become probabilities."""
+    """Conversion of log-odds to probabilities."""
     model = load(name)
     return (
         f"Calibration: probability = sigmoid(logit / temperature + offset), temperature {model.temperature:.3f}, "

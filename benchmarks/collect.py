@@ -17,8 +17,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dexzoo.data.collect import Configuration, collect
-from dexzoo.data.datamodule import GraspDataModule, GraspDataset
+from dexzoo.collection.collect import Configuration, collect
+from dexzoo.collection.rendering import render
+from dexzoo.data.batches import GraspDataset
+from dexzoo.data.datamodule import GraspDataModule
 
 NUM_KILLS = 10
 LONGEST = 15.0
@@ -98,12 +100,13 @@ def loading(folder: str, batch_size: int) -> float:
     """Grasps a second of an epoch of balanced batches, whose views are encoded already, on two threads."""
     torch.set_num_threads(2)
     data = GraspDataModule(folder, batch_size)
+    data.renderer = render
     source = data.source
     encoded = {"features": torch.zeros(source.views.num_rows, FEATURES, dtype=torch.float16)}
     success, scene, view, view_scene = (
         torch.from_numpy(array) for array in (source.success, source.grasp_scene, source.grasp_view, source.view_scene)
     )
-    grasps = source.world_grasps.waypoints
+    grasps = source.world_grasps.trajectory
     dataset = GraspDataset(grasps, success.float(), scene, view, encoded, view_scene, data.T_aimed_world)
     fastest = 0.0
     for _ in range(3):

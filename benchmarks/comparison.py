@@ -10,6 +10,7 @@ import json
 import sys
 from pathlib import Path
 
+from dexzoo.collection.rendering import render
 from dexzoo.comparison.charts import draw_charts
 from dexzoo.comparison.compare import compare, load_models
 from dexzoo.comparison.inside import draw_inside
@@ -31,6 +32,7 @@ def main() -> None:
     parser.add_argument("--charts", type=Path, default=ROOT / "docs" / "comparison")
     options = parser.parse_args()
     models, data = load_models(options.models), GraspDataModule(options.data)
+    data.renderer = render
     result = compare(models, data, options.split)
     options.out.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
     options.charts.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""All 294 objects of the grasp set in one picture, by category and coloured by split.
+"""All 294 objects of the grasp set in one picture, by category and colored by split.
 
 python benchmarks/contact_sheet.py --out docs/objects.png
 """
@@ -9,12 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dexzoo import plots
-from dexzoo.camera import Camera
+from dexzoo.perception.camera import Camera, look_at
 from dexzoo.sim.shapes import NUM_OBJECTS, make_object, object_names, split_of
+from dexzoo.viewing import pictures
 
 COLUMNS, CELL, HEADING, MARGIN = 26, 92, 26, 10
-COLOURS = {"train": (226, 160, 62), "validation": (96, 170, 96), "test": (92, 142, 214)}
+COLORS = {"train": (226, 160, 62), "validation": (96, 170, 96), "test": (92, 142, 214)}
 INK, FONT = (30, 30, 30), cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -36,7 +36,7 @@ def main() -> None:
                 left = MARGIN + column * CELL
                 sheet[top + HEADING : top + HEADING + CELL, left : left + CELL] = portrait(name)
                 column += 1
-    plots.save(sheet, options.out)
+    pictures.save(sheet, options.out)
 
 
 def pack() -> list[list[str]]:
@@ -58,22 +58,22 @@ def portrait(name: str) -> np.ndarray:
     size = 2 * CELL  # drawn twice as large and scaled down, for smooth edges
     long = mesh.extents[2] < 0.3 * mesh.extents[0] and mesh.extents[1] < 0.7 * mesh.extents[0]
     azimuth, elevation = (-48, 62) if long else (-60, 38)  # what is long lies along the diagonal
-    pose = plots.look_at(mesh.bounds.mean(0), 1.2, np.deg2rad(azimuth), np.deg2rad(elevation))
+    pose = look_at(mesh.bounds.mean(0), 1.2, np.deg2rad(azimuth), np.deg2rad(elevation))
     seen = (mesh.vertices - pose[:3, 3]) @ pose[:3, :3]
     image = seen[:, :2] / seen[:, 2:]
     low, high = image.min(0), image.max(0)
     focal = 0.92 * size / (high - low).max()
     middle = size / 2 - focal * (low + high) / 2
     camera = Camera(size, size, focal, focal, *middle.tolist())
-    picture, _ = plots.render([plots.Solid(mesh, COLOURS[split_of(name)])], camera, pose, table=False)
+    picture, _ = pictures.render([pictures.Solid(mesh, COLORS[split_of(name)])], camera, pose, table=False)
     return cv2.resize(picture, (CELL, CELL), interpolation=cv2.INTER_AREA)
 
 
 def legend(sheet: np.ndarray) -> None:
     write(sheet, "Each object fills its cell, whatever its size.  Split:", MARGIN + 4, MARGIN + 18)
     left = 460
-    for split, colour in COLOURS.items():
-        cv2.rectangle(sheet, (left, MARGIN + 5), (left + 16, MARGIN + 21), colour, -1)
+    for split, color in COLORS.items():
+        cv2.rectangle(sheet, (left, MARGIN + 5), (left + 16, MARGIN + 21), color, -1)
         write(sheet, f"{split} ({len(object_names(split))})", left + 22, MARGIN + 18)
         left += 170
 

@@ -1,9 +1,9 @@
-"""Count what a grasp set holds, and check it.
+"""Count the contents of a grasp set, and check them.
 
 python benchmarks/data.py --out benchmarks/results/data.json
 python benchmarks/data.py --data DIR --again 500 --views out/views.png
---again tries that many grasps again, at the working setting and at the reference; --views draws some views, to be
-looked at.
+--again tries that many grasps again, at the working setting and at the reference; --views draws some views for
+inspection.
 """
 
 import argparse
@@ -17,13 +17,12 @@ import cv2
 import numpy as np
 import torch
 
-from dexzoo.data.collect import NEIGHBOUR_RATIO, SCALE_RANGE
+from dexzoo.collection.collect import NEIGHBOR_RATIO, SCALE_RANGE
+from dexzoo.collection.rendering import rebuild, render
 from dexzoo.data.grasp_set import GraspSet
-from dexzoo.data.rendering import rebuild
 from dexzoo.data.schema import SPLITS
 from dexzoo.data.writer import MANIFEST
-from dexzoo.grasp import GRASP_TYPES, Grasps
-from dexzoo.hand import default_hand
+from dexzoo.grasp import GRASP_TYPES
 from dexzoo.sim import trial
 from dexzoo.sim.world import REFERENCE, WORKING
 from dexzoo.verification import FRICTION
@@ -40,7 +39,7 @@ def main() -> None:
     parser.add_argument("--views", type=Path)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    data = GraspSet(options.data)
+    data = GraspSet(options.data, renderer=render)
     result = count(data, json.loads((options.data / MANIFEST).read_text()))
     if options.again:
         result["tried_again"] = agreement(data, options.again)
@@ -76,7 +75,7 @@ def count(data: GraspSet, manifest: dict) -> dict[str, object]:
         "configuration": manifest["configuration"],
         "scale": SCALE_RANGE,
         "friction": FRICTION,
-        "neighbours_per_generated": NEIGHBOUR_RATIO,
+        "neighbors_per_generated": NEIGHBOR_RATIO,
         "grasps": len(data.success),
         "scenes": data.scenes.num_rows,
         "skipped": manifest["counts"]["skipped"],
@@ -100,24 +99,23 @@ def count(data: GraspSet, manifest: dict) -> dict[str, object]:
 
 def outside_limits(data: GraspSet) -> int:
     """Grasps with a waypoint whose joints leave their limits."""
-    hand = default_hand()
-    joints = data.world_grasps.joints
+    hand, joints = data.hand, data.world_grasps.joints
     wrong = (joints < hand.lower - 1e-4) | (joints > hand.upper + 1e-4)
     return int(wrong.flatten(1).any(1).sum())
 
 
 def agreement(data: GraspSet, num: int) -> dict[str, object]:
-    """Labels of grasps drawn from all scenes against those of the same trial again."""
+    """Agreement between the labels of grasps drawn from all scenes and those of repeated trials."""
     rng = np.random.default_rng(0)
     scenes = rng.permutation(data.scenes.num_rows)[: -(-num // GRASPS_A_SCENE)]
     labels: dict[str, list[np.ndarray]] = {"stored": [], "working": [], "reference": []}
     for done, number in enumerate(scenes, 1):
         rows = rng.permutation(np.flatnonzero(data.grasp_scene == number))[:GRASPS_A_SCENE]
         scene = rebuild(data.scenes.slice(number, 1).to_pylist()[0])
-        grasps = Grasps(data.world_grasps.waypoints[torch.tensor(rows)], "world")
+        grasps = data.world_grasps[torch.tensor(rows)]
         labels["stored"].append(data.success[rows])
         for name, physics in (("working", WORKING), ("reference", REFERENCE)):
-            labels[name].append(trial.run(scene, grasps, default_hand(), physics=physics).success)
+            labels[name].append(trial.run(scene, grasps, physics=physics).success)
         sys.stderr.write(f"{done} of {len(scenes)} scenes tried again\n")
     joined = {name: np.concatenate(parts) for name, parts in labels.items()}
     return {
@@ -130,16 +128,16 @@ def agreement(data: GraspSet, num: int) -> dict[str, object]:
 
 
 def picture(data: GraspSet) -> np.ndarray:
-    """Views drawn from the whole set: near is bright, black is no reading or not the object."""
+    """Random views of the set: near is bright; black means no reading, or not the object."""
     rng = np.random.default_rng(0)
     chosen = np.sort(rng.permutation(data.views.num_rows)[: COLUMNS * ROWS])
     tiles = []
     for view in chosen:
         seen = data.observation(int(view))
         near, far = seen.depth[seen.mask].min(), seen.depth[seen.mask].max()
-        grey = np.where(seen.mask, 255 - 200 * (seen.depth - near) / max(far - near, 1e-6), 0).astype(np.uint8)
+        gray = np.where(seen.mask, 255 - 200 * (seen.depth - near) / max(far - near, 1e-6), 0).astype(np.uint8)
         name = data.scenes["object"][int(data.view_scene[view])].as_py()
-        tiles.append(cv2.putText(np.ascontiguousarray(grey), name, (6, 216), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 255))
+        tiles.append(cv2.putText(np.ascontiguousarray(gray), name, (6, 216), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 255))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
     return np.vstack([np.hstack(tiles[i : i + COLUMNS]) for i in range(0, len(tiles), COLUMNS)])
 

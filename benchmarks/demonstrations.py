@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dexzoo import plots
-from dexzoo.camera import Camera, look_at
 from dexzoo.generators.demonstration import load_demonstrations
 from dexzoo.grasp import GRASP_TYPES, GRIP, PREGRASP, SQUEEZE
-from dexzoo.hand import default_hand
+from dexzoo.hand import Hand
+from dexzoo.perception.camera import Camera, look_at
 from dexzoo.sim import Scene
 from dexzoo.sim.shapes import make_object
+from dexzoo.viewing import pictures
 
 SIZE = 220
 AZIMUTHS = {"power_tube": 4.2, "pinch_support": 2.2, "lateral": 4.6, "edge": 4.4, "handle": 2.4}
@@ -25,23 +25,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/demonstrations.png"))
     options = parser.parse_args()
-    hand, camera = default_hand(), Camera(SIZE, SIZE, 1.2 * SIZE, 1.2 * SIZE, SIZE / 2, SIZE / 2)
-    pictures, titles = [], []
-    for one in sorted(load_demonstrations(), key=lambda shown: shown.grasp_type):
+    camera = Camera(SIZE, SIZE, 1.2 * SIZE, 1.2 * SIZE, SIZE / 2, SIZE / 2)
+    cells, titles = [], []
+    for one in sorted(load_demonstrations(Hand.load()), key=lambda shown: shown.grasp_type):
         scene = Scene.place(make_object(one.object), seed=0)
         mesh = scene.object.mesh.copy().apply_transform(scene.T_world_object)
-        solids = [plots.Solid(mesh, plots.OBJECT_COLOUR)]
+        solids = [pictures.Solid(mesh, pictures.OBJECT_COLOR)]
         if scene.support is not None:
-            solids.append(plots.Solid(scene.support.mesh, (150, 150, 150)))
-        waypoints = one.grasp.moved(scene.T_world_object).waypoints[0]
+            solids.append(pictures.Solid(scene.support.mesh, (150, 150, 150)))
+        grasp = one.grasp.transformed(scene.T_world_object)
         name = GRASP_TYPES[one.grasp_type]
-        target = np.append(waypoints[GRIP, :2].numpy() * 0.5, mesh.bounds[:, 2].mean() + 0.03)
+        target = np.append(grasp.position[0, GRIP, :2].numpy() * 0.5, mesh.bounds[:, 2].mean() + 0.03)
         pose = look_at(target, 0.48, AZIMUTHS.get(name, 0.5), 0.45)
         for moment, waypoint in (("", PREGRASP), ("grip", GRIP), ("squeeze", SQUEEZE)):
-            drawn = [*solids, plots.hand_solid(hand, waypoints[waypoint])]
-            pictures.append(plots.render(drawn, camera, pose)[0])
+            drawn = [*solids, pictures.grasp_solid(grasp, waypoint)]
+            cells.append(pictures.render(drawn, camera, pose)[0])
             titles.append(moment or f"{name}: {one.object}")
-    plots.save(plots.grid(pictures, titles, columns=6), options.out)
+    pictures.save(pictures.grid(cells, titles, columns=6), options.out)
 
 
 if __name__ == "__main__":

@@ -26,15 +26,16 @@ from generator_figures import COSTS, FLAGS, TOP, Trials, compared
 from torch import Tensor
 
 from dexzoo import verification
-from dexzoo.camera import Observation
-from dexzoo.data.collect import SCALE_RANGE, object_of
+from dexzoo.collection.collect import SCALE_RANGE, object_of
+from dexzoo.generators import GraspGenerator
+from dexzoo.generators.approach import ApproachMotion
+from dexzoo.generators.contact_density import ContactDensity, Grips
 from dexzoo.generators.demonstration import load_demonstrations
-from dexzoo.generators.density import GraspDensity, Grips
-from dexzoo.generators.generator import GraspGenerator
 from dexzoo.generators.heuristic import HeuristicGenerator
-from dexzoo.generators.kopicki import KopickiGenerator, Way
+from dexzoo.generators.kopicki import KopickiGenerator
 from dexzoo.grasp import GRIP, NUM_TYPES, Grasps
-from dexzoo.hand import default_hand
+from dexzoo.hand import Hand
+from dexzoo.perception import Observation
 from dexzoo.sim import ObjectModel, Scene, trial
 from dexzoo.sim.shapes import MASS_RANGE, make_object
 
@@ -46,6 +47,7 @@ ORIGINAL_STEPS = (50, 450)
 """Kopicki's steps of annealing before and after the best are chosen."""
 KERNELS, SAMPLES = (3_000, 10_000, 30_000, 100_000), (1_000, 3_000, 10_000, 30_000)
 NUM_GROWTH = 3
+HAND = Hand.load()
 FORGET_PEAK = Path("/proc/self/clear_refs")
 """Where Linux is told to count the most memory held anew."""
 Setting = Callable[[int], tuple[Scene, Observation, int, int]]
@@ -56,7 +58,8 @@ class Replaced(GraspGenerator):
     """The Kopicki generator with one method of one of its parts replaced; fails where there is no such method."""
 
     def __init__(self, part: type, method: str, by: Callable[..., Tensor]) -> None:
-        self.generator, self.part, self.method, self.by = KopickiGenerator(), part, method, by
+        self.generator, self.part, self.method, self.by = kopicki(), part, method, by
+        self.hand = self.generator.hand
 
     def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
         """As the Kopicki generator."""
@@ -64,28 +67,34 @@ class Replaced(GraspGenerator):
             return self.generator.generate(observation, num_grasps, seed)
 
 
-def any_posture(_: GraspDensity, grips: Grips) -> Tensor:
+def kopicki(**settings: Any) -> KopickiGenerator:  # noqa: ANN401, whatever the generator takes
+    """The generator that learns from the shipped demonstrations."""
+    return KopickiGenerator(load_demonstrations(HAND), **settings)
+
+
+def any_posture(_: ContactDensity, grips: Grips) -> Tensor:
     """Every posture is as likely; samples are still drawn along the demonstrated path."""
     return grips.joints.new_zeros(len(grips.demo))
 
 
 @cache
 def without_type(grasp_type: int) -> KopickiGenerator:
-    return KopickiGenerator([d for d in load_demonstrations() if d.grasp_type != grasp_type])
+    return KopickiGenerator([d for d in load_demonstrations(HAND) if d.grasp_type != grasp_type])
 
 
 def variants(practised: Path | None) -> dict[str, Callable[[int], GraspGenerator]]:
     """For each variant, the generator of a scene by its number; made once where it is the same for all."""
     fixed = {
-        "kopicki": KopickiGenerator,
-        "heuristic": HeuristicGenerator,
-        "without C": partial(Replaced, GraspDensity, "log_posture", any_posture),
-        "without collision cost": partial(Replaced, Way, "cost", Way.table_cost),  # the table stays in the way
-        "without improvement": partial(KopickiGenerator, num_steps=(0, 0)),
-        "annealing": partial(KopickiGenerator, search="annealing", num_steps=ORIGINAL_STEPS),
+        "kopicki": kopicki,
+        "heuristic": partial(HeuristicGenerator, HAND),
+        "without C": partial(Replaced, ContactDensity, "log_posture", any_posture),
+        # the table stays in the way
+        "without collision cost": partial(Replaced, ApproachMotion, "cost", ApproachMotion.table_cost),
+        "without improvement": partial(kopicki, num_steps=(0, 0)),
+        "annealing": partial(kopicki, search="annealing", num_steps=ORIGINAL_STEPS),
     }
     if practised:
-        fixed["practised"] = lambda: KopickiGenerator(load_demonstrations(str(practised)))
+        fixed["practised"] = lambda: KopickiGenerator(load_demonstrations(HAND, str(practised)))
     made = {name: cache(make) for name, make in fixed.items()}
     each = {name: lambda _, make=make: make() for name, make in made.items()}
     return each | {"one demonstration left out": lambda number: without_type(number % NUM_TYPES)}
@@ -134,7 +143,7 @@ def main() -> None:
         if options.pictures:
             generator_pictures.rank(result["variants"], options.pictures / "generator_rank.png")
             first = done[options.variants[0]]
-            generator_pictures.top(first, setting, TOP, options.pictures / "generated.png")
+            generator_pictures.top(first, setting, HAND, TOP, options.pictures / "generated.png")
     text = json.dumps(result, indent=2)
     if options.out:
         options.out.write_text(text + "\n")
@@ -199,29 +208,30 @@ def attempt(
 ) -> Trials:
     """Generate and try; no grasps where the generator gives up."""
     grasps, cost, error = timed(generator, view, seed, num_grasps)
-    world = grasps.to_frame("world", view.T_world_camera)
-    outcomes = trial.run(scene, world, default_hand(), torch.get_num_threads())
-    obj, likelihood = scene.object, world.log_likelihood
+    outcomes = trial.run(scene, grasps, torch.get_num_threads())
+    obj, likelihood = scene.object, grasps.log_likelihood
     return Trials(
         obj.name,
         obj.category or obj.name,
         redrawn,
         error,
         cost,
-        world.waypoints[:, GRIP].numpy(),
+        grasps.wrist[:, GRIP].numpy(),
+        grasps.joints[:, GRIP].numpy(),
+        grasps.grasp_type.numpy(),
         np.zeros(0, np.float32) if likelihood is None else likelihood.numpy(),
         np.stack([getattr(outcomes, flag) for flag in FLAGS], -1),
     )
 
 
 def timed(generator: GraspGenerator, view: Observation, seed: int, num: int) -> tuple[Grasps, np.ndarray, str]:
-    """Grasps in the camera frame; seconds of wall and of processor time, and megabytes at most; why there are none."""
+    """Grasps; seconds of wall and of processor time, and megabytes at most; why there are none."""
     FORGET_PEAK.write_text("5")
     start = np.array([time.perf_counter(), time.process_time(), 0])
     try:
         grasps, error = generator.generate(view, num, seed), ""
     except (RuntimeError, ValueError) as reason:  # as the interface says
-        grasps, error = Grasps(torch.zeros(0, 10, 28), "camera"), str(reason)
+        grasps, error = Grasps.none(generator.hand), str(reason)
     megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return grasps, np.array([time.perf_counter(), time.process_time(), megabytes]) - start, error
 
@@ -229,12 +239,12 @@ def timed(generator: GraspGenerator, view: Observation, seed: int, num: int) -> 
 def growth(setting: Setting) -> dict[str, Any]:
     """What a view costs with more and more samples and kernels, by the median of the first scenes."""
     views = [setting(number)[1] for number in range(NUM_GROWTH)]
-    timed(KopickiGenerator(), views[0], 0, 100)  # what is loaded and compiled on the way counts for none
+    timed(kopicki(), views[0], 0, 100)  # what is loaded and compiled on the way counts for none
     result: dict[str, Any] = {"scenes": NUM_GROWTH, "threads": torch.get_num_threads()}
     for name, sizes in (("num_samples", SAMPLES), ("num_kernels", KERNELS)):
         rows = []
         for size in sizes:
-            generator = KopickiGenerator(**{name: size})
+            generator = kopicki(**{name: size})
             cost = np.median([timed(generator, view, 0, 100)[1] for view in views], axis=0)
             rows.append({name: size} | dict(zip(COSTS, cost.tolist(), strict=True)))
         result[name] = rows

@@ -13,7 +13,7 @@ import torch
 from scipy.stats import mannwhitneyu
 
 from dexzoo import rotation
-from dexzoo.grasp import GRASP_TYPES, POSITION, QUATERNION, TYPE
+from dexzoo.grasp import GRASP_TYPES
 
 NUM_BOOTSTRAP = 2000
 TOP = 5
@@ -64,7 +64,8 @@ class Tried(Kept):
 class Trials(Tried):
     """What became of one variant's grasps in one scene, best first.
 
-    grip: (n, 28) waypoints at the grip in the world frame. outcome: (n, 4) bool, columns FLAGS.
+    wrist: (n, 7) poses at the grip in the world frame, position and quaternion. joints: (n, joint) angles there.
+    grasp_type: (n,) indices into GRASP_TYPES. outcome: (n, 4) bool, columns FLAGS.
     redrawn: scenes drawn before this one that could not be set or seen. cost: (3,) COSTS of generating.
     """
 
@@ -73,12 +74,14 @@ class Trials(Tried):
     redrawn: int
     error: str
     cost: np.ndarray
-    grip: np.ndarray
+    wrist: np.ndarray
+    joints: np.ndarray
+    grasp_type: np.ndarray
     log_likelihood: np.ndarray
     outcome: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.grip)
+        return len(self.wrist)
 
 
 Counts = tuple[np.ndarray, np.ndarray]
@@ -87,7 +90,7 @@ Counts = tuple[np.ndarray, np.ndarray]
 
 def compared(done: dict[str, dict[int, Trials]]) -> dict[str, dict[str, Any]]:
     """The figures of each variant, and by how much it differs from the first one."""
-    return beside_first(done, lambda scenes: summarise(list(scenes.values())), {"success": share, "top1": top1})
+    return beside_first(done, lambda scenes: summarize(list(scenes.values())), {"success": share, "top1": top1})
 
 
 def beside_first(
@@ -139,9 +142,9 @@ def change_of(here: Counts, there: Counts) -> dict[str, Any]:
     return rate(resampled(here) - resampled(there))
 
 
-def summarise(rows: list[Trials]) -> dict[str, Any]:
-    outcome, grip = np.concatenate([row.outcome for row in rows]), np.concatenate([row.grip for row in rows])
-    success, kind = outcome[:, 0], grip[:, TYPE].astype(int)
+def summarize(rows: list[Trials]) -> dict[str, Any]:
+    outcome, kind = (np.concatenate([getattr(row, name) for row in rows]) for name in ("outcome", "grasp_type"))
+    success = outcome[:, 0]
     cost = np.array([row.cost for row in rows])
     apart = np.array([apartness(row) for row in rows if len(row) > 1])
     within = [auroc(row.log_likelihood, row.success) for row in rows if 0 < row.success.sum() < len(row)]
@@ -197,10 +200,10 @@ def auroc(score: np.ndarray, success: np.ndarray) -> float | None:
 
 
 def apartness(row: Trials) -> tuple[float, float]:
-    """Mean distance in metres and angle in radians between the wrists of two grasps of a scene."""
+    """Mean distance in meters and angle in radians between the wrists of two grasps of a scene."""
     first, second = np.triu_indices(len(row), 1)
-    quaternion = torch.tensor(row.grip[:, QUATERNION])
-    distance = np.linalg.norm(row.grip[first, POSITION] - row.grip[second, POSITION], axis=1)
+    position, quaternion = row.wrist[:, :3], torch.tensor(row.wrist[:, 3:])
+    distance = np.linalg.norm(position[first] - position[second], axis=1)
     return float(distance.mean()), float(rotation.angle(quaternion[first], quaternion[second]).mean())
 
 

@@ -10,11 +10,13 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from torch import Tensor
 
-from dexzoo import plots
-from dexzoo.camera import Camera, Observation, look_at
-from dexzoo.hand import default_hand
+from dexzoo.hand import Hand
+from dexzoo.perception import Camera, Observation
+from dexzoo.perception.camera import look_at
 from dexzoo.sim import Scene
+from dexzoo.viewing import pictures
 
 THESIS_ALL, THESIS_FIRST = 0.485, 0.693
 """Success of all of its generator's grasps, and of the first of each scene (thesis, chapter 3)."""
@@ -67,7 +69,11 @@ def written(figure: plt.Figure, path: Path) -> None:
 
 
 def top(
-    scenes: dict[int, Any], setting: Callable[[int], tuple[Scene, Observation, int, int]], num: int, path: Path
+    scenes: dict[int, Any],
+    setting: Callable[[int], tuple[Scene, Observation, int, int]],
+    hand: Hand,
+    num: int,
+    path: Path,
 ) -> None:
     """The first grasps on the first scene of each of ten categories, seen from where the camera stood.
 
@@ -77,29 +83,32 @@ def top(
     firsts: dict[str, int] = {}
     for number, row in scenes.items():
         firsts.setdefault(row.category, number)
-    pictures, titles = [], []
+    cells, titles = [], []
     for number in list(firsts.values())[:NUM_OBJECTS]:
         row, (scene, view, _, _) = scenes[number], setting(number)
         for place in range(num):
             name = f"{place + 1}:" if place else f"{row.object}, 1:"
             if place < len(row):
                 holds = bool(row.success[place])
-                pictures.append(shown(scene, view.T_world_camera, row.grip[place], holds))
+                wrist, joints = torch.tensor(row.wrist[place]), torch.tensor(row.joints[place])
+                cells.append(shown(scene, view.T_world_camera, hand, wrist, joints, holds))
                 titles.append(f"{name} {'holds' if holds else 'fails'}")
             else:
-                pictures.append(np.full((SIZE, SIZE, 3), 255, np.uint8))
+                cells.append(np.full((SIZE, SIZE, 3), 255, np.uint8))
                 titles.append(f"{name} none")
-    plots.save(plots.grid(pictures, titles, columns=2 * num), path)
+    pictures.save(pictures.grid(cells, titles, columns=2 * num), path)
 
 
-def shown(scene: Scene, T_world_camera: np.ndarray, grip: np.ndarray, holds: bool) -> plots.Image:
+def shown(
+    scene: Scene, T_world_camera: np.ndarray, hand: Hand, wrist: Tensor, joints: Tensor, holds: bool
+) -> pictures.Image:
     """The object and the hand at the grip, green where the trial held and red where not."""
     mesh = scene.object.mesh.copy().apply_transform(scene.T_world_object)
-    solids = [plots.Solid(mesh, plots.OBJECT_COLOUR)]
+    solids = [pictures.Solid(mesh, pictures.OBJECT_COLOR)]
     if scene.support is not None:
-        solids.append(plots.Solid(scene.support.mesh, (150, 150, 150)))
-    solids.append(plots.hand_solid(default_hand(), torch.tensor(grip), HOLDS if holds else FAILS))
-    target = (mesh.bounds.mean(0) + grip[:3]) / 2
+        solids.append(pictures.Solid(scene.support.mesh, (150, 150, 150)))
+    solids.append(pictures.hand_solid(hand, wrist, joints, HOLDS if holds else FAILS))
+    target = (mesh.bounds.mean(0) + wrist[:3].numpy()) / 2
     away = T_world_camera[:3, 3] - mesh.bounds.mean(0)
     pose = look_at(target, 0.6, float(np.arctan2(away[1], away[0])), 0.6)
-    return plots.render(solids, Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2), pose)[0]
+    return pictures.render(solids, Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2), pose)[0]

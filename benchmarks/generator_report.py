@@ -1,4 +1,4 @@
-"""What benchmarks/report.py writes of the generators, from the JSON of benchmarks/generator.py."""
+"""Text and tables about the generators for benchmarks/report.py, from the JSON of benchmarks/generator.py."""
 
 import math
 from typing import Any
@@ -7,7 +7,7 @@ from tables import RESULTS, percent, read, span, table
 
 
 def generator() -> str:
-    """What has been measured of the generators; each part as soon as its benchmark has been run."""
+    """All measurements of the generators; each part if its benchmark has been run."""
     parts = {
         "generator": generators,
         "generator_ablation": ablation,
@@ -23,7 +23,7 @@ def generators(found: dict[str, Any]) -> str:
     tables = [
         outcomes(variants),
         table(
-            ("generator", "processor seconds", "longest", "MB", "wrists apart, mm", "and degrees"),
+            ("generator", "processor seconds", "longest", "MB", "wrist distance, mm", "wrist angle, degrees"),
             [
                 (
                     name,
@@ -68,20 +68,21 @@ def generators(found: dict[str, Any]) -> str:
         [
             f"`benchmarks/generator.py`; {first['scenes']} scenes of {first['objects']} {found['split']} objects, one "
             f"view and at most {found['num_grasps']} grasps each, one trial of each grasp; intervals are 95 % "
-            f"bootstrap over scenes. The grasps of `{name}` that hold are of {first['types_among_successes']} types, "
-            f"and the first of a scene holds {points(first['top1_above_all'])} more often than all do.\n",
+            f"bootstrap over scenes. The successful grasps of `{name}` have {first['types_among_successes']} types. "
+            "The "
+            f"success rate of the first grasp of a scene exceeds that of all grasps by "
+            f"{points(first['top1_above_all'])}.\n",
             *tables[:1],
             *against,
-            f"Time of a view, median and longest (threads: {found['threads']}; wall times stand under Cost), most "
-            "memory of the process with all that it has loaded, and how far the wrists of two grasps of a scene differ "
-            "on average:\n",
+            f"Processor time per view, median and longest (threads: {found['threads']}; for wall times see Cost), peak "
+            "memory of the whole process, and mean difference between the wrist poses of two grasps of a scene:\n",
             *tables[1:],
         ]
     )
 
 
 def outcomes(variants: dict[str, Any]) -> str:
-    """How often the grasps of each variant hold; a scene without a grasp counts as a first that fails."""
+    """Success of each variant's grasps; a scene without a grasp counts as a failure of the first grasp."""
     head = ("generator", "scenes", "without a grasp", "grasps", "hold", "first holds", "first five hold")
     rows = [
         (
@@ -113,12 +114,15 @@ def ablation(found: dict[str, Any]) -> str:
         if "against" in row
     ]
     return (
-        "### Without its parts\n\n"
-        f"On {first['scenes']} scenes, at most {found['num_grasps']} grasps each; all against the whole on the same "
-        "scenes.\n\n"
+        "### Ablations\n\n"
+        f"On {first['scenes']} scenes, at most {found['num_grasps']} grasps each; all variants are compared with the "
+        "complete generator on the same scenes.\n\n"
         + outcomes(found["variants"])
         + "\n"
-        + table(("against the whole", "hold", "first holds", "scenes without a grasp", "processor seconds"), rows)
+        + table(
+            ("against the complete generator", "hold", "first holds", "scenes without a grasp", "processor seconds"),
+            rows,
+        )
     )
 
 
@@ -139,9 +143,9 @@ def other_objects(found: dict[str, Any]) -> str:
     ]
     head = tuple(f"{name}: {what}" for name in variants for what in ("grasps", "hold", "first holds"))
     return (
-        "### On objects from elsewhere\n\n"
-        f"{first['objects']} scanned and CAD household objects that are no part of dexzoo, {first['scenes']} scenes, "
-        "0.2 kg, friction 0.7.\n\n" + outcomes(variants) + "\n" + table(("object", *head), rows)
+        "### On external objects\n\n"
+        f"{first['objects']} scans and CAD models of household objects that are not part of dexzoo, {first['scenes']} "
+        "scenes, 0.2 kg, friction 0.7.\n\n" + outcomes(variants) + "\n" + table(("object", *head), rows)
     )
 
 
@@ -158,9 +162,9 @@ def growth(found: dict[str, Any]) -> str:
         for row in found[name]
     ]
     return (
-        f"### Cost\n\nMedian over {found['scenes']} views; threads: {found['threads']}. The other number stays at its "
-        "default. Memory is that of the process with all that it has loaded.\n\n"
-        + table(("", "number", "seconds", "processor seconds", "MB at most"), rows)
+        f"### Cost\n\nMedian over {found['scenes']} views; threads: {found['threads']}. The other parameter keeps its "
+        "default. Memory is the peak of the whole process.\n\n"
+        + table(("", "number", "seconds", "processor seconds", "peak MB"), rows)
     )
 
 
@@ -169,12 +173,12 @@ def counted(row: dict[str, Any]) -> tuple[str, str]:
 
 
 def share(value: float | None) -> str:
-    """In percent; nothing where there was nothing to count."""
+    """A share in percent; empty for None."""
     return "" if value is None else percent(value)
 
 
 def rate(found: dict[str, Any]) -> str:
-    """With its interval."""
+    """A rate with its interval."""
     return f"{share(found['rate'])} ({span(found['interval'], 100, 1)})"
 
 

@@ -1,7 +1,7 @@
 """Which evaluator to use on objects that dexzoo did not make: a recorded grasp set of meshes, and the comparison on it.
 
 python benchmarks/meshes.py FOLDER [MODEL ...] --set out/meshes --out benchmarks/results/evaluators_meshes.json
-FOLDER holds a folder per object with mesh.obj, in metres, z up, and, where there are any, hull_*.obj. Each object is
+FOLDER holds a folder per object with mesh.obj, in meters, z up, and, where there are any, hull_*.obj. Each object is
 put down `--scenes` times, seen once, and the default generator's grasps for that view are tried once each. The set
 keeps images and outcomes and goes on where it stopped. Mass 0.2 kg and friction 0.7 for all. There is nothing to choose
 gm's threshold on, so that gm has no accuracy. Scenes in which no grasp holds count, as failures of every ranking.
@@ -25,7 +25,6 @@ from dexzoo.comparison.report import markdown
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import decode_path, encode_path, encode_view
 from dexzoo.data.writer import GraspSetWriter, SceneRows, scene_rows
-from dexzoo.hand import default_hand
 from dexzoo.sim import trial
 
 
@@ -68,19 +67,18 @@ def tried(row: dict[str, Any], setting: partial[Any], num_grasps: int) -> SceneR
     row |= {"mass": MESH_MASS, "friction": MESH_FRICTION, "generated": 0, "held": 0}
     try:
         scene, view, seed, _ = setting()
-        world = dexzoo.generate(view, num_grasps, seed).to_frame("world", view.T_world_camera)
+        grasps = dexzoo.generate(view, num_grasps, seed)
     except (ValueError, RuntimeError) as error:
         return scene_rows(row | {"skipped": str(error)})
-    hand, likelihood = default_hand(), world.log_likelihood
-    path = encode_path(world, hand)
+    path = encode_path(grasps)
     # what is simulated is what will be read, to the last bit
-    found = trial.run(scene, decode_path(path, world.grasp_type, hand), hand)
+    found = trial.run(scene, decode_path(path, grasps.grasp_type, grasps.hand))
     columns = {
         "view": [0] * len(path),
-        "grasp_type": world.grasp_type.numpy(),
+        "grasp_type": grasps.grasp_type.numpy(),
         "source": ["generated"] * len(path),
         "rank": np.arange(len(path)),
-        "log_likelihood": likelihood.numpy(),
+        "log_likelihood": grasps.log_likelihood.numpy(),
         "path": path,
         **{name: getattr(found, name) for name in ("success", "collided", "starts_inside", "unstable")},
     }

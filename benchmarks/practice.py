@@ -10,11 +10,12 @@ import shutil
 import sys
 from pathlib import Path
 
-from dexzoo.data.collect import object_of
-from dexzoo.data.practice import practise
+from dexzoo.collection.collect import object_of
+from dexzoo.collection.practice import practise
 from dexzoo.generators.demonstration import distinct, load_demonstrations
 from dexzoo.generators.kopicki import KopickiGenerator
 from dexzoo.grasp import GRASP_TYPES
+from dexzoo.hand import Hand
 
 
 def main() -> None:
@@ -23,7 +24,8 @@ def main() -> None:
     parser.add_argument("--num_objects", type=int, default=60)
     parser.add_argument("--max_per_type", type=int, default=8)
     options = parser.parse_args()
-    generator = KopickiGenerator(num_per_type=20)
+    shipped = load_demonstrations(hand := Hand.load())
+    generator = KopickiGenerator(shipped, num_per_type=20)
     for number in range(options.num_objects):
         name = object_of(number, "train")
         folder = options.out / "tried" / f"{number:03d}_{name}"
@@ -32,18 +34,18 @@ def main() -> None:
         unfinished = folder.with_name(f".{folder.name}")
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir(parents=True)
-        learnt = list(practise(generator, name, seed=number))
-        for place, one in enumerate(learnt):
+        learned = list(practise(generator, name, seed=number))
+        for place, one in enumerate(learned):
             one.save(unfinished / f"{place}.safetensors")
         unfinished.rename(folder)
-        sys.stderr.write(f"{name}: {len(learnt)}\n")
+        sys.stderr.write(f"{name}: {len(learned)}\n")
     found = [
         one
         for folder in sorted((options.out / "tried").iterdir())
         if any(folder.glob("*.safetensors"))
-        for one in load_demonstrations(str(folder))
+        for one in load_demonstrations(hand, str(folder))
     ]
-    for number, one in enumerate(distinct([*load_demonstrations(), *found], options.max_per_type)):
+    for number, one in enumerate(distinct([*shipped, *found], options.max_per_type)):
         one.save(options.out / f"{number:03d}_{GRASP_TYPES[one.grasp_type]}.safetensors")
 
 

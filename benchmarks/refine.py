@@ -4,63 +4,119 @@ python benchmarks/refine.py --evaluator RUN --judge OTHER_RUN --out benchmarks/r
 The objects of a split come round in turn, each scene with its own drawn mass and friction, in which a grasp is tried as
 given and as refined. `--folder` keeps what was done in each scene, so that a run can be continued: take a new one when
 the program, the meshes or what a try's name means has changed. Hyper-parameters are chosen with `--split validation`
-and `--tries FILE`: JSON of names, and for each the arguments of `dexzoo.refine` that differ. Intervals are 95 %
+and `--tries FILE`: JSON of names, and for each the arguments of `dexzoo.refine` that differ, where `weights` holds
+weights of terms by name, 0 to do without, and `variables` is "grip", "uncoupled" or "waypoints". Intervals are 95 %
 bootstrap over scenes; OMP_NUM_THREADS bounds the threads. The simulator selects nothing.
 """
 
 import argparse
+import inspect
 import json
-import math
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
-from generator import Setting, set_scene
+from generator import HAND, Setting, kopicki, set_scene
 from generator_figures import FLAGS
 from refine_figures import Given, Refined, compared
 
 import dexzoo
 from dexzoo import Grasps, Observation
-from dexzoo.generators.density import GraspDensity
-from dexzoo.generators.kopicki import KopickiGenerator
-from dexzoo.grasp import GRIP
-from dexzoo.hand import default_hand
+from dexzoo.generators import GraspDensity, GraspGenerator
+from dexzoo.generators.generator import MIN_CLEARANCE
+from dexzoo.grasp import GRIP, Trajectory
+from dexzoo.hand import Hand
 from dexzoo.models.evaluator import GraspEvaluator
-from dexzoo.refinement import Refinement, Region, Weights, method, thesis
+from dexzoo.perception import View
+from dexzoo.perception.view import SHADOW_DEPTHS, SUPPORT_SHARE
+from dexzoo.refinement import Refinement, Term, TrustRegion, default_terms
+from dexzoo.refinement.refinement import NUM_STEPS, STEP_SIZE
+from dexzoo.refinement.terms import AROUND, MAX_LACK, Penetration, Prior, SelfCollision, Shadow, Spread, Table
+from dexzoo.refinement.variables import GripVariables
 from dexzoo.sim import Scene, trial
+from experiments import thesis_ascent
+from experiments.variables import UncoupledVariables, WaypointVariables
 
 METHOD = "method"
 SPLITS = ("test", "validation")
 NUM_POINTS = 500
 """Observed points by which penetration is measured."""
+WEIGHED = (Spread, Prior, Penetration, Shadow, Table, SelfCollision)
+"""The terms beside the log-odds, in the order of a record."""
+VARIABLES = {"grip": GripVariables, "uncoupled": UncoupledVariables, "waypoints": WaypointVariables}
 Variant = Callable[[Grasps, Observation, GraspDensity], Refinement]
+Choice = Callable[[list[Term]], list[Term]]
+"""What is climbed in place of the default terms."""
 
 
-def by_refine(evaluator: GraspEvaluator, judge: GraspEvaluator | None, **arguments: Any) -> Variant:  # noqa: ANN401
+def by_refine(
+    evaluator: GraspEvaluator,
+    judge: GraspEvaluator | None,
+    terms: Choice = list,
+    **arguments: Any,  # noqa: ANN401, whatever refine takes
+) -> Variant:
     def run(grasps: Grasps, view: Observation, density: GraspDensity) -> Refinement:
-        return dexzoo.refine(grasps, view, evaluator, judge=judge, density=density, **arguments)
+        chosen = terms(default_terms(evaluator, density))
+        return dexzoo.refine(grasps, view, evaluator, judge=judge, terms=chosen, **arguments)
 
     return run
 
 
-def whatever_rises(run: Variant) -> Variant:
-    """The variant without acceptance: what the climb found is taken wherever the objective rose."""
+def without(*names: str) -> Choice:
+    """All terms but some."""
+    return lambda terms: [term for term in terms if term.name not in names]
 
-    def taken(grasps: Grasps, view: Observation, density: GraspDensity) -> Refinement:
-        with patch.object(method, "MAX_LACK", math.inf):
-            return run(grasps, view, density)
 
-    return taken
+def weighed(weights: dict[str, float]) -> Choice:
+    """The terms with other weights, some by name; one of weight 0 is left out. ValueError for a name there is not."""
+    known = {"log_odds", *(term.name for term in WEIGHED)}
+    if unknown := set(weights) - known:
+        raise ValueError(f"terms {', '.join(sorted(unknown))} are unknown; use some of {', '.join(sorted(known))}")
+
+    def choose(terms: list[Term]) -> list[Term]:
+        for term in terms:
+            term.weight = weights.get(term.name, term.weight)
+        return [term for term in terms if term.weight]
+
+    return choose
+
+
+class Untested(Table):
+    """The term without its test: what the climb found is taken wherever the objective rose."""
+
+    def accepts(self, view: View, hand: Hand, before: Trajectory, after: Trajectory) -> torch.Tensor:
+        """All may be replaced."""
+        return Term.accepts(self, view, hand, before, after)
+
+
+def whatever_rises(terms: list[Term]) -> list[Term]:
+    """The terms, none of which objects to a replacement."""
+    return [Untested(term.weight) if isinstance(term, Table) else term for term in terms]
 
 
 def by_thesis(evaluator: GraspEvaluator, group: str) -> Variant:
-    return lambda grasps, view, _: thesis.ascend(grasps, view, evaluator, group=group)
+    return lambda grasps, view, _: thesis_ascent.ascend(grasps, view, evaluator, group=group)
+
+
+def default_settings() -> dict[str, Any]:
+    """What is set where no argument is given, and the lengths that terms and acceptance go by: for a record.
+
+    Weights are told without their sign: the prior is added, the others are subtracted.
+    """
+    return {
+        "region": asdict(TrustRegion()),
+        "weights": {term.name: abs(inspect.signature(term).parameters["weight"].default) for term in WEIGHED},
+        "num_steps": NUM_STEPS,
+        "step_size": STEP_SIZE,
+        "clearance": {"table": MIN_CLEARANCE, "around": AROUND, "middle": SUPPORT_SHARE, "lack": MAX_LACK},
+        "shadow": list(SHADOW_DEPTHS),
+    }
 
 
 def variants(
@@ -70,17 +126,17 @@ def variants(
     by = partial(by_refine, model, judge)
     known = {
         METHOD: by(),
-        **{f"group {name}": by_thesis(model, name) for name in thesis.GROUPS},
-        "L-BFGS": by(optimiser="lbfgs"),
-        "Metropolis-Hastings": by(optimiser="metropolis"),
-        "random search": by(optimiser="random"),
-        "no prior": by(weights=Weights(prior=0.0)),
-        "no penetration or shadow": by(weights=Weights(penetration=0.0, shadow=0.0)),
-        "no table, nor its test": by(weights=Weights(table=0.0)),
-        "no self-collision": by(weights=Weights(self_collision=0.0)),
-        "no coupling": by(variables="uncoupled"),
-        "no acceptance": whatever_rises(by_refine(model, None)),
-        "280 free numbers": by(variables="waypoints"),
+        **{f"group {name}": by_thesis(model, name) for name in thesis_ascent.GROUPS},
+        "L-BFGS": by(optimizer="lbfgs"),
+        "Metropolis-Hastings": by(optimizer="metropolis"),
+        "random search": by(optimizer="random"),
+        "no prior": by(without("prior")),
+        "no penetration or shadow": by(without("penetration", "shadow")),
+        "no table, nor its test": by(without("table")),
+        "no self-collision": by(without("self_collision")),
+        "no coupling": by(variables=UncoupledVariables),
+        "no acceptance": by_refine(model, None, whatever_rises),
+        "280 free numbers": by(variables=WaypointVariables),
     }
     if judge is None:
         known["judge ffh"] = by_refine(model, dexzoo.load("ffh"))
@@ -92,14 +148,18 @@ def variants(
 
     for label, other in others.items():
         add("--others", label, by_refine(other, judge))
-        for group in thesis.GROUPS:
+        for group in thesis_ascent.GROUPS:
             add("--others", f"group {group} by {label}", by_thesis(other, group))
     if tries:
         for name, arguments in json.loads(tries.read_text()).items():
-            for key, kind in (("region", Region), ("weights", Weights)):
-                if key in arguments:
-                    arguments[key] = kind(**arguments[key])
-            add(str(tries), name, by(**arguments))
+            if "trust_region" in arguments:
+                arguments["trust_region"] = TrustRegion(**arguments["trust_region"])
+            if "variables" in arguments:
+                kind = arguments["variables"]
+                if kind not in VARIABLES:
+                    raise ValueError(f"{tries}: variables {kind!r} are unknown; use one of {', '.join(VARIABLES)}")
+                arguments["variables"] = VARIABLES[kind]
+            add(str(tries), name, by(weighed(arguments.pop("weights", {})), **arguments))
     return known
 
 
@@ -159,7 +219,7 @@ def main() -> None:
         "judge": options.judge,
         "digest": {"evaluator": model.digest, "judge": judge.digest if judge else None},
         "others": {name: other.digest for name, other in others.items()},
-        "defaults": method.default_settings(),
+        "defaults": default_settings(),
         "split": source,
         "num_grasps": options.num_grasps,
         "without_grasp": sum(not len(row) for row in given.values()),
@@ -176,7 +236,7 @@ def run(
     chosen: dict[str, Variant], setting: Setting, folder: Path, refined: Path, scenes: int, num_grasps: int
 ) -> None:
     """Try what is not yet there, all variants on a scene before the next scene."""
-    generator = KopickiGenerator()
+    generator = kopicki()
     for number in range(scenes):
         paths = {name: refined / name / f"{number:03d}.npz" for name in chosen}
         missing = {name: path for name, path in paths.items() if not path.exists()}
@@ -195,7 +255,7 @@ def run(
             sys.stderr.write(f"{number} {given.object}: no grasp is found\n")
             continue
         density = generator.density(view, seed)
-        grasps = Grasps(torch.tensor(given.waypoints), "world")
+        grasps = given.grasps(HAND)
         for name, path in missing.items():
             row = attempt(chosen[name], grasps, given, scene, view, density)
             row.save(path)
@@ -203,16 +263,15 @@ def run(
             sys.stderr.write(f"{number} {given.object}, {name}: {held}\n")
 
 
-def give(generator: KopickiGenerator, scene: Scene, view: Observation, seed: int, num_grasps: int) -> Given:
+def give(generator: GraspGenerator, scene: Scene, view: Observation, seed: int, num_grasps: int) -> Given:
     """The generator's grasps of a view, tried; none where it gives up."""
     try:
-        grasps = generator.generate(view, num_grasps, seed).to_frame("world", view.T_world_camera)
+        grasps = generator.generate(view, num_grasps, seed)
     except (RuntimeError, ValueError):  # as the interface says
-        grasps = Grasps(torch.zeros(0, 10, 28), "world")
+        grasps = Grasps.none(generator.hand)
     obj = scene.object
-    return Given(
-        obj.name, obj.category or obj.name, grasps.waypoints.numpy(), tried(scene, grasps), depth(view, grasps)
-    )
+    arrays = (value.numpy() for value in (grasps.wrist, grasps.joints, grasps.grasp_type))
+    return Given(obj.name, obj.category or obj.name, *arrays, tried(scene, grasps), depth(view, grasps))
 
 
 def attempt(
@@ -239,18 +298,19 @@ def attempt(
 
 def tried(scene: Scene, grasps: Grasps) -> np.ndarray:
     """(n, 4) bool, columns FLAGS."""
-    outcomes = trial.run(scene, grasps, default_hand(), torch.get_num_threads())
+    outcomes = trial.run(scene, grasps, torch.get_num_threads())
     return np.stack([getattr(outcomes, flag) for flag in FLAGS], -1)
 
 
 def depth(view: Observation, grasps: Grasps) -> np.ndarray:
-    """(n,) metres that an observed point lies at most in a link, up to the grip."""
-    hand, points = default_hand(), torch.from_numpy(view.points_world)
+    """(n,) meters that an observed point lies at most in a link, up to the grip."""
+    points = torch.from_numpy(view.points_world)
     points = points[torch.linspace(0, len(points) - 1, min(NUM_POINTS, len(points))).long()]
     deepest: list[float] = []
     for row in range(len(grasps)):
-        links = grasps.wrist_pose[row, : GRIP + 1, None] @ hand.forward_kinematics(grasps.joints[row, : GRIP + 1])
-        deepest.append(float(-hand.signed_distance(links, points).amin().clamp_max(0)))
+        posture = grasps.hand.forward_kinematics(grasps.joints[row, : GRIP + 1])
+        links = grasps.wrist_pose[row, : GRIP + 1, None] @ posture
+        deepest.append(float(-grasps.hand.signed_distance(links, points).amin().clamp_max(0)))
     return np.array(deepest)
 
 

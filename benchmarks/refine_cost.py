@@ -12,26 +12,23 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from generator import FORGET_PEAK, set_scene
+from generator import FORGET_PEAK, kopicki, set_scene
 from generator_figures import COSTS
 
 import dexzoo
-from dexzoo.generators.kopicki import KopickiGenerator
-from dexzoo.refinement import Weights
+from dexzoo.refinement import Term, default_terms
 
 SCENE = 3
 NUM_STEPS, FEW_STEPS = 20, 2
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 """Numbers of grasps, refined in few steps."""
 REPEATS = 3
-NOTHING = Weights(**dict.fromkeys(asdict(Weights()), 0.0))
 
 
 def main() -> None:
@@ -41,21 +38,22 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     _, view, seed, _ = set_scene("test", None, SCENE)
-    generator = KopickiGenerator()
+    generator = kopicki()
     grasps = generator.generate(view, 100, seed)
     model = dexzoo.load(options.evaluator)
     density = generator.density(view, seed)
 
-    def refine(num: int = 100, num_steps: int = NUM_STEPS, weights: Weights | None = None) -> None:
+    def refine(num: int = 100, num_steps: int = NUM_STEPS, terms: list[Term] | None = None) -> None:
         some = grasps[np.arange(num) % len(grasps)]
-        dexzoo.refine(some, view, model, num_steps=num_steps, weights=weights, density=density)
+        dexzoo.refine(some, view, model, num_steps=num_steps, terms=terms, prior=density)
 
     refine(num_steps=FEW_STEPS)  # what is loaded and compiled on the way counts for none
-    alone = least(partial(refine, weights=NOTHING))
+    log_odds, *others = default_terms(model, density)
+    alone = least(partial(refine, terms=[log_odds]))
     terms = {}
-    for name, weight in asdict(Weights()).items():
-        only = least(partial(refine, weights=replace(NOTHING, **{name: weight})))
-        terms[name] = only["processor_seconds"] - alone["processor_seconds"]
+    for term in others:
+        only = least(partial(refine, terms=[log_odds, term]))
+        terms[term.name] = only["processor_seconds"] - alone["processor_seconds"]
     result = {
         "evaluator": options.evaluator,
         "threads": torch.get_num_threads(),

@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from generator_figures import Counts, Tried, beside_first, change_of, mean, rate, resampled, share
 
+from dexzoo.grasp import Grasps
+from dexzoo.hand import Hand
 from dexzoo.refinement import RANKINGS, rank
 
 GENERATOR = "generator"
@@ -17,17 +19,23 @@ GENERATOR = "generator"
 class Given(Tried):
     """The generator's grasps of a scene, best first, and what became of them.
 
-    waypoints: (n, 10, 28) in the world frame. outcome: (n, 4) bool, columns FLAGS. penetration: (n,) metres.
+    wrist, joints, grasp_type: as in `dexzoo.Grasps`. outcome: (n, 4) bool, columns FLAGS. penetration: (n,) meters.
     """
 
     object: str
     category: str
-    waypoints: np.ndarray
+    wrist: np.ndarray
+    joints: np.ndarray
+    grasp_type: np.ndarray
     outcome: np.ndarray
     penetration: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.waypoints)
+        return len(self.wrist)
+
+    def grasps(self, hand: Hand) -> Grasps:
+        """The grasps of the hand, without their likelihood."""
+        return Grasps(*(torch.tensor(array) for array in (self.wrist, self.joints, self.grasp_type)), hand)
 
 
 @dataclass(frozen=True)
@@ -76,12 +84,12 @@ def compared(given: dict[int, Given], done: dict[str, dict[int, Refined]]) -> di
     """The figures of each variant, and on the scenes that it shares with the first one by how much it differs."""
 
     def figures(rows: dict[int, Refined]) -> dict[str, Any]:
-        return summarise([given[number] for number in rows], list(rows.values()))
+        return summarize([given[number] for number in rows], list(rows.values()))
 
     return beside_first(done, figures, {"success": share})
 
 
-def summarise(given: list[Given], rows: list[Refined]) -> dict[str, Any]:
+def summarize(given: list[Given], rows: list[Refined]) -> dict[str, Any]:
     before, after = share(given), share(rows)
     was, now = (np.concatenate([row.success for row in some]) for some in (given, rows))
     hit = np.concatenate([row.collided for row in rows])
@@ -132,7 +140,7 @@ def transitions(was: np.ndarray, now: np.ndarray, hit: np.ndarray) -> dict[str, 
 
 
 def depths(rows: list[Any]) -> Counts:
-    """Metres in all and grasps of each scene, whose quotient is the mean."""
+    """Meters in all and grasps of each scene, whose quotient is the mean."""
     return np.array([row.penetration.sum() for row in rows]), np.array([len(row.penetration) for row in rows])
 
 

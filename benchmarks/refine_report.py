@@ -1,4 +1,4 @@
-"""What benchmarks/report.py writes of refinement, from the JSON of benchmarks/refine.py."""
+"""Text and tables about refinement for benchmarks/report.py, from the JSON of benchmarks/refine.py."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from generator_report import points, rate, share
 from tables import RESULTS, read, table
 
 RULES = {
-    "generator": "generator's first",
+    "generator": "generator's order",
     "before": "score before",
     "after": "score after",
     "lesser": "lesser of both",
@@ -14,18 +14,18 @@ RULES = {
     "mean": "mean of evaluator and judge",
 }
 GROUP = "group "
-"""How the names of the thesis' groups begin in the benchmark."""
+"""Prefix of the groups of Zhao (2019) among the benchmark's variants."""
 HEADS = {
     "refinement": "",
-    "refinement_ablation": "### What each term is worth, and other weights as guides\n\n",
-    "refinement_validation": "### With a judge and without, on validation objects\n\n",
-    "refinement_meshes": "### On objects from elsewhere\n\n",
+    "refinement_ablation": "### Ablations: terms of the objective and other evaluators\n\n",
+    "refinement_validation": "### With and without a judge, on validation objects\n\n",
+    "refinement_meshes": "### On external objects\n\n",
 }
-"""What stands over each run of the benchmark."""
+"""Heading of each run of the benchmark."""
 
 
 def refinement() -> str:
-    """What has been measured of refinement; each part as soon as its benchmark has been run."""
+    """All measurements of refinement; each part if its benchmark has been run."""
     parts = [head + whole(read(name)) for name, head in HEADS.items() if (RESULTS / f"{name}.json").exists()]
     if (RESULTS / "refinement_cost.json").exists():
         parts.append(cost(read("refinement_cost")))
@@ -37,9 +37,9 @@ def whole(found: dict[str, Any]) -> str:
     variants = found["variants"]
     name, first = next(iter(variants.items()))
     judge = f", and if `{found['judge']}` agrees" if found["judge"] else ""
-    none = f"; in {found['without_grasp']} more scenes it found none" if found["without_grasp"] else ""
+    none = f"; in {found['without_grasp']} more scenes the generator found none" if found["without_grasp"] else ""
     several = first["scenes"] > first["objects"]
-    alike = "; several are of one object, so that for objects they are somewhat too narrow" if several else ""
+    alike = "; several scenes show the same object, so for objects they are somewhat too narrow" if several else ""
     went = heads(first["transitions"])
     rules = first["top1"]
     every = [rule for rule in RULES if any(rule in row["top1"] for row in variants.values())]
@@ -47,19 +47,21 @@ def whole(found: dict[str, Any]) -> str:
         [
             f"`benchmarks/refine.py`; {first['scenes']} scenes of {first['objects']} objects ({found['split']}), at "
             f"most {found['num_grasps']} grasps of the Kopicki generator each, {first['grasps']:,} in all{none}. "
-            f"`{name}` is guided by `{found['evaluator']}`, and replaces a grasp where the objective rises and the way "
-            f"keeps its clearance{judge}; so do the others but for what their names say, and the thesis' groups, which "
-            "replace all. The same trials before and after; the simulator selects nothing. Intervals are over "
-            f"scenes{alike}. \"against the first\" compares with the first row; \"gains for a loss\" are failures that "
-            "come to hold for each success that is lost.\n",
+            f"`{name}` uses the evaluator `{found['evaluator']}`, and replaces a grasp if the objective rises and the "
+            f"approach keeps its clearance{judge}. The other variants differ from it as named; the groups of Zhao "
+            "(2019) "
+            "replace all grasps. The trials before and after are the same, and the simulator does not select grasps. "
+            f"Intervals are over scenes{alike}. \"against the first\" is the difference to the first row; \"gains per "
+            "loss\" is the number of failures that come to hold for each success that is lost.\n",
             outcomes(variants),
-            "How deep at most any link lies in what is seen, up to the grip, and the probability of success by what "
-            "guides; \"failed\" are grasps whose objective was no number; 30 steps on one thread:\n",
+            "Maximum penetration of observed points into a link, up to the grip, and mean predicted probability of "
+            "success; "
+            "\"failed\" counts grasps with a non-finite objective; 30 steps on one thread:\n",
             ways(variants),
-            "Where the grasps went (thesis, Tables 4.2 and 4.3):\n",
+            "Transitions of outcomes (Zhao 2019, Tables 4.2 and 4.3):\n",
             table(("variant", *went), [(other, *row["transitions"].values()) for other, row in variants.items()]),
-            f"The grasp that each rule ranks first in a scene, by `{name}`, and what became of those chosen (thesis, "
-            "Tables 4.4 to 4.6):\n",
+            f"Success of the first grasp of each scene by ranking rule, with `{name}`, and transitions of its outcome "
+            "(Zhao 2019, Tables 4.4 to 4.6):\n",
             table(
                 ("ranked by", "holds unrefined", "holds refined", "change", *went),
                 [
@@ -68,7 +70,7 @@ def whole(found: dict[str, Any]) -> str:
                     for rule, row in rules.items()
                 ],
             ),
-            "The first of each scene after refinement, by variant:\n",
+            "Success of the first grasp of each scene after refinement, by variant:\n",
             table(
                 ("variant", *(RULES[rule] for rule in every)),
                 [
@@ -82,7 +84,7 @@ def whole(found: dict[str, Any]) -> str:
 
 
 def groups(variants: dict[str, Any]) -> list[str]:
-    """What became of the first of each scene in the thesis' groups; nothing where none was run."""
+    """Transitions of the first grasp of each scene in the groups of Zhao (2019); empty if none was run."""
     rows = [
         (other, RULES[rule], *row["top1"][rule]["transitions"].values())
         for other, row in variants.items()
@@ -90,7 +92,11 @@ def groups(variants: dict[str, Any]) -> list[str]:
         if GROUP in other
     ]
     head = ("variant", "ranked by", *heads(next(iter(variants.values()))["transitions"]))
-    return ["What became of the first of each scene in the thesis' groups:\n", table(head, rows)] if rows else []
+    return (
+        ["Transitions of the first grasp of each scene in the groups of Zhao (2019):\n", table(head, rows)]
+        if rows
+        else []
+    )
 
 
 def heads(names: dict[str, Any]) -> tuple[str, ...]:
@@ -98,9 +104,9 @@ def heads(names: dict[str, Any]) -> tuple[str, ...]:
 
 
 def outcomes(variants: dict[str, Any]) -> str:
-    """What held before and after."""
+    """Success before and after."""
     head = (
-        "variant", "grasps", "hold before", "hold after", "change", "against the first", "gains for a loss", "replaced",
+        "variant", "grasps", "hold before", "hold after", "change", "against the first", "gains per loss", "replaced",
         "hit the table before", "after",
     )  # fmt: skip
     rows = [
@@ -122,16 +128,16 @@ def outcomes(variants: dict[str, Any]) -> str:
 
 
 def ways(variants: dict[str, Any]) -> str:
-    """How deep the links lie in what is seen, what the evaluator thinks, and what it costs."""
+    """Depth of the links in the observed points, scores of the evaluator, and cost."""
     head = (
         "variant", "penetration before, mm", "after", "change", "mean score before", "after", "score rises for",
-        "failed", "processor seconds for 100",
+        "failed", "processor seconds per 100",
     )  # fmt: skip
     rows = [
         (
             name,
             *(f"{1000 * row[key]:.2f}" for key in ("penetration_before", "penetration_after")),
-            millimetres(row["penetration_change"]),
+            millimeters(row["penetration_change"]),
             *(f"{row[key]:.3f}" for key in ("score_before", "score_after")),
             share(row["score_higher"]),
             row["failed"],
@@ -142,8 +148,8 @@ def ways(variants: dict[str, Any]) -> str:
     return table(head, rows)
 
 
-def millimetres(change: dict[str, Any]) -> str:
-    """A change of metres with its interval."""
+def millimeters(change: dict[str, Any]) -> str:
+    """A change in meters, as millimeters with its interval."""
     return "{:+.2f} ({:+.2f} to {:+.2f})".format(*(1000 * x for x in (change["rate"], *change["interval"])))
 
 
@@ -154,14 +160,14 @@ def cost(found: dict[str, Any]) -> str:
     rows = [(f"{row['grasps']:,}", *(f"{row[key]:.{n}f}" for key, n in keys.items())) for row in found["growth"]]
     return "\n".join(
         [
-            f"### Cost\n\n`benchmarks/refine_cost.py`; guided by `{found['evaluator']}`, {found['threads']} threads. "
-            f"100 grasps x {found['num_steps']} steps take {whole['seconds']:.1f} s and at most "
-            f"{whole['peak_megabytes']:.0f} MB with all that is loaded; the evaluator alone takes "
-            f"{alone['seconds']:.1f} s. The density behind the prior is made once for a view, in "
-            f"{density['seconds']:.1f} s. Processor seconds that each term adds, as the difference of two runs, to the "
-            f"evaluator's {alone['processor_seconds']:.1f}:\n",
+            f"### Cost\n\n`benchmarks/refine_cost.py`; evaluator `{found['evaluator']}`, {found['threads']} threads. "
+            f"100 grasps x {found['num_steps']} steps take {whole['seconds']:.1f} s, and the whole process at most "
+            f"{whole['peak_megabytes']:.0f} MB. The evaluator alone takes {alone['seconds']:.1f} s. The density of the "
+            f"prior is computed once per view, in {density['seconds']:.1f} s. Processor seconds that each term adds "
+            "to the "
+            f"{alone['processor_seconds']:.1f} of the evaluator, as the difference of two runs:\n",
             table(tuple(name.replace("_", " ") for name in terms), [tuple(f"{value:.2f}" for value in terms.values())]),
-            f"In {found['few_steps']} steps:\n",
-            table(("grasps", "seconds", "processor seconds", "MB at most"), rows),
+            f"With {found['few_steps']} steps:\n",
+            table(("grasps", "seconds", "processor seconds", "peak MB"), rows),
         ]
     )

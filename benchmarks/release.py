@@ -20,14 +20,15 @@ import torch
 from torchmetrics.functional.classification import binary_auroc
 
 import dexzoo
+from dexzoo.collection.rendering import render
 from dexzoo.comparison.compare import GENERATED
 from dexzoo.comparison.figures import figures
 from dexzoo.comparison.scores import model_scores, read_labels
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.models.evaluator import GraspEvaluator
-from dexzoo.models.zoo import load_weights
+from dexzoo.models.files import load_weights
 from dexzoo.resources import resource
-from dexzoo.training import read_checkpoint
+from dexzoo.training.command_line import read_checkpoint
 
 TOLERANCE = 0.001
 """A tenth of a point."""
@@ -62,7 +63,7 @@ def release(run: Path, folder: Path, data: str, limits: list[str] | None = None)
     if limits is not None or "limits" not in card:
         card["limits"] = [*LIMITS, *(limits or [])]
     if full is not None:
-        differences = compared(model, full, GraspDataModule(data))
+        differences = compared(model, full, opened(data))
         told = ", ".join(f"{name} {100 * value:.2f}" for name, value in differences.items())
         sys.stderr.write(f"half precision moves figures by points: {told}\n")
         if max(differences.values()) > TOLERANCE:
@@ -96,9 +97,16 @@ def compared(model: GraspEvaluator, other: GraspEvaluator, data: GraspDataModule
     return {name: abs(float(value[0] - found[1][name][0])) for name, value in found[0].items()}
 
 
+def opened(data: str, num_scenes: int | None = None) -> GraspDataModule:
+    """A grasp set whose views are rendered where it keeps no images."""
+    module = GraspDataModule(data, num_scenes=num_scenes)
+    module.renderer = render
+    return module
+
+
 def small_part(model: GraspEvaluator, data: str) -> dict[str, dict[str, Any]]:
     """What a card says of the generated grasps of the first scenes of the test split."""
-    part = GraspDataModule(data, num_scenes=SMALL_PART).dataset("test", model, [GENERATED])
+    part = opened(data, SMALL_PART).dataset("test", model, [GENERATED])
     probability = model_scores(model, part, model.architecture).probability
     auroc = float(binary_auroc(torch.from_numpy(probability), part.success.long()))
     return {"small_part": {"split": "test", "scenes": SMALL_PART, "grasps": len(part), "auroc": round(auroc, 4)}}

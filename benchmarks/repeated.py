@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dexzoo.collection.rendering import render
 from dexzoo.comparison.compare import GENERATED, load_models
 from dexzoo.comparison.figures import draw_scenes, figures_with_intervals
 from dexzoo.comparison.scores import Scores, model_scores, read_labels
@@ -36,7 +37,9 @@ def main() -> None:
     parser.add_argument("--split", default="test", choices=SPLITS)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    text = json.dumps(foreseen(options.models, GraspDataModule(options.data), options.split), indent=2)
+    data = GraspDataModule(options.data)
+    data.renderer = render
+    text = json.dumps(foreseen(options.models, data, options.split), indent=2)
     if options.out:
         options.out.write_text(text + "\n")
     sys.stdout.write(text + "\n")

@@ -40,34 +40,37 @@ def summary() -> str:
 
     rows = [
         (
-            f"in {generated['scenes']} scenes in which at least one grasp holds: success of all of the generator's",
+            f"success rate of all generated grasps, in {generated['scenes']} scenes with at least one grasp that holds",
             percent(generated["success_rate"]),
         ),
-        ("success of the first of each scene in the generator's own order", of_hundred(gm["top1"])),
-        ("in the order of `em_fk`", of_hundred(best["top1"])),
-        ("accuracy of `em_fk` on all of them", of_hundred(best["accuracy"])),
-        ("its AUROC", valued(best["auroc"], 1, 3)),
+        ("success rate of the first grasp of each scene, in the generator's order", of_hundred(gm["top1"])),
+        ("the same, in the order of `em_fk`", of_hundred(best["top1"])),
+        ("accuracy of `em_fk` on all generated grasps", of_hundred(best["accuracy"])),
+        ("AUROC of `em_fk`", valued(best["auroc"], 1, 3)),
         (
-            f"in {method['scenes']} scenes, success of all of the generator's grasps, {method['grasps']:,}",
+            f"success rate of all {method['grasps']:,} generated grasps in {method['scenes']} scenes",
             rate(method["success_before"]),
         ),
-        ("the same grasps refined", rate(method["success_after"])),
+        ("the same grasps, refined", rate(method["success_after"])),
         ("change", points(method["change"])),
-        ("change by the thesis' ascent (its group A)", points(ascent["change"])),
-        ("the first of each scene in the order of `em_fk`, as generated", rate(first["unrefined"])),
+        ("change by the gradient ascent of Zhao (2019), group A", points(ascent["change"])),
+        (
+            "success rate of the first grasp of each scene in the order of `em_fk`, as generated",
+            rate(first["unrefined"]),
+        ),
         ("the same, refined", rate(first["refined"])),
         ("change", points(first["change"])),
         (
-            "grasps that would hit the table or a block, as generated and refined",
+            "grasps that hit the table or a block, as generated and refined",
             f"{method['collided_before']} and {method['collided_after']}",
         ),
         (
-            f"on {meshes['objects']} scanned and CAD objects from elsewhere, success of {meshes['grasps']} grasps",
+            f"success rate of {meshes['grasps']} grasps on {meshes['objects']} external objects (scans and CAD models)",
             rate(meshes["success_before"]),
         ),
         ("the same, refined", rate(meshes["success_after"])),
     ]
-    return table(("what, on test objects", "figure (95 % interval over scenes)"), rows)
+    return table(("measure, on test objects", "value (95 % interval over scenes)"), rows)
 
 
 def counts() -> str:
@@ -76,9 +79,9 @@ def counts() -> str:
     lines = [
         f"{data['grasps']:,} grasps in {data['scenes']:,} scenes with {data['views']:,} views, {data['megabytes']:.0f} "
         f"MB; objects: {objects}. {percent(data['hold'])} hold; {data['collided']:,} hit the table or a block, "
-        f"{data['starts_inside']} would start inside the object, {data['unstable']} were unstable. "
-        f"{data['duplicates']} are duplicates, {data['outside_limits']} leave the limits of the joints.\n",
-        f"Scenes tried and left out: {skipped(data['skipped'])}. With theirs, {percent(data['hold_of_all_generated'])} "
+        f"{data['starts_inside']} start inside the object, {data['unstable']} are unstable. "
+        f"{data['duplicates']} are duplicates, {data['outside_limits']} exceed the joint limits.\n",
+        f"Skipped scenes: {skipped(data['skipped'])}. With their grasps, {percent(data['hold_of_all_generated'])} "
         "of all generated grasps hold.\n",
     ]
     names = {
@@ -86,7 +89,7 @@ def counts() -> str:
         "source": "source and split",
         "category": "category",
         "type": "type",
-        "rank": "place in the order",
+        "rank": "rank",
     }
     for name, head in names.items():
         rows = [(value, f"{row['grasps']:,}", percent(row["hold"])) for value, row in data[f"by_{name}"].items()]
@@ -94,15 +97,16 @@ def counts() -> str:
     again = data.get("tried_again")
     if again:
         lines.append(
-            f"{again['grasps']} grasps tried again: {percent(again['agree_at_working_setting'])} of the labels come "
-            f"out the same at the working setting, {percent(again['agree_at_reference_setting'])} at the reference "
-            f"({1000 * again['reference']['timestep']:g} ms).\n"
+            f"{again['grasps']} grasps tried again: {percent(again['agree_at_working_setting'])} of the labels are "
+            f"reproduced at the working setting, {percent(again['agree_at_reference_setting'])} at the reference "
+            f"setting ({1000 * again['reference']['timestep']:g} ms).\n"
         )
     made = data["configuration"]
     physics = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in made["physics"].items())
     lines.append(
-        f"Made with: generator {made['generator']}, {made['num_grasps']} grasps asked for and {made['num_views']} "
-        f"views a scene, seed {made['seed']}, {made['trials']} trial(s) of each grasp; physics: {physics}.\n"
+        f"Settings: generator {made['generator']}, {made['num_grasps']} requested grasps and {made['num_views']} "
+        "views per "
+        f"scene, seed {made['seed']}, {made['trials']} trial(s) of each grasp; physics: {physics}.\n"
     )
     return "\n".join(lines)
 
@@ -115,12 +119,12 @@ def sensor() -> str:
     frames, views = read("sensor"), read("views")
     real, simulated = frames["real"], frames["simulated"]
     measures = {
-        "depth_std_mm": "depth against the table's plane, std, mm",
-        "local_std_mm": "the same without what bends over more than some 20 pixels",
-        "local_std_disparity": "that in pixels of disparity at 574 pixels of focal length and 75 mm",
-        "correlation_length_x": "pixels along a row until its correlation is a half",
-        "correlation_length_y": "along a column",
-        "step_mm": "between neighbouring values of depth, mm",
+        "depth_std_mm": "deviation from the table's plane, std, mm",
+        "local_std_mm": "the same without variation over more than about 20 pixels",
+        "local_std_disparity": "the latter in pixels of disparity (focal length 574 pixels, baseline 75 mm)",
+        "correlation_length_x": "correlation length along a row (to one half), pixels",
+        "correlation_length_y": "correlation length along a column, pixels",
+        "step_mm": "step between neighboring depth values, mm",
     }
     noise = [
         (name if key == "depth_std_mm" else "", label, row[key], simulated["table"][name][key])
@@ -137,15 +141,16 @@ def sensor() -> str:
     times = [(name, *row.values()) for name, row in views["milliseconds"].items()]
     return "\n".join(
         [
-            f"`benchmarks/sensor.py`: {frames['real_frames']} real frames, {frames['simulated_frames']} simulated ones "
+            f"`benchmarks/sensor.py`: {frames['real_frames']} real frames, {frames['simulated_frames']} simulated "
+            "frames "
             "of mugs, bowls and bottles with the same intrinsics, height, angle and distance.\n",
             table(("noise on the table at", "", "real", "simulated"), noise),
             table(("pixels without a reading", "real", "simulated"), shares),
             table(("within objects", "real", "simulated"), holes),
             "`benchmarks/views.py`: one object of each of the 20 categories, "
-            f"{views['views_of_each']} views of each, one core. For the rays of an ideal 460 x 460 view alone MuJoCo's "
-            f"ray caster takes {views['rays alone by mujoco.mj_multiRay, 460 x 460']} ms.\n",
-            table(("milliseconds a view", "median", "slowest category's median", "slowest view"), times),
+            f"{views['views_of_each']} views of each, one core. The rays of an ideal 460 x 460 view alone take "
+            f"{views['rays alone by mujoco.mj_multiRay, 460 x 460']} ms with MuJoCo's ray caster.\n",
+            table(("milliseconds per view", "median", "slowest category's median", "slowest view"), times),
         ]
     )
 
@@ -167,9 +172,10 @@ def objects() -> str:
     ]
     head = ("train", "validation", "test", "longest side, mm", "shortest side, mm", "convex parts", "distance, mm")
     return (
-        f"`benchmarks/objects.py`: {found['objects']} objects of at most {found['most_parts']} convex parts, whose "
-        f"surface is within {found['worst_surface_distance_mm']:.2f} mm of the mesh everywhere (two-sided Hausdorff "
-        f"distance). All of them are made in {found['seconds_to_make_all']:.0f} s.\n\n"
+        f"`benchmarks/objects.py`: {found['objects']} objects with at most {found['most_parts']} convex parts each. "
+        "The "
+        f"surface of the parts is within {found['worst_surface_distance_mm']:.2f} mm of the mesh everywhere (two-sided "
+        f"Hausdorff distance). All objects take {found['seconds_to_make_all']:.0f} s to make.\n\n"
     ) + table(("category", *head), rows)
 
 
@@ -179,14 +185,14 @@ def between(values: list[int]) -> str:
 
 
 def labels(found: dict[str, Any]) -> str:
-    """How far the labels can be trusted, and how fast they come."""
+    """Reliability of the labels, and speed of the trials."""
     curves, timed, creep = found["agreement_with_itself_when_moved"], found["timed"], found["creep"]
     slid, true = creep["working"], creep["reference"]
     names = {
-        "working": "the working setting, as labels are made",
-        "reference": "the reference setting",
-        "plain, same steps": "a plain loop over one MjData, the working setting's steps",
-        "plain, uniform steps": "a plain loop, 2 ms and noslip from start to end",
+        "working": "working setting, used for labels",
+        "reference": "reference setting",
+        "plain, same steps": "plain loop over one MjData, steps of the working setting",
+        "plain, uniform steps": "plain loop, 2 ms and noslip from start to end",
     }
     moved = [
         (name, *(f"{percent(curve[offset]['agree'])} of {curve[offset]['grasps']:,}" for offset in curve))
@@ -207,37 +213,37 @@ def labels(found: dict[str, Any]) -> str:
     categories = [(name, *row.values()) for name, row in found["categories"].items()]
     return "\n".join(
         [
-            f"`benchmarks/simulator.py`; {found['grasps']:,} grasps of {found['objects']} objects, of which "
-            f"{percent(found['hold'])} hold; {found['unstable']} were unstable. The working setting (2 ms until the "
+            f"`benchmarks/simulator.py`; {found['grasps']:,} grasps of {found['objects']} objects, "
+            f"{percent(found['hold'])} hold; {found['unstable']} are unstable. The working setting (2 ms until the "
             "lift, then 4 ms, ends when the object is lost) and the reference setting (1 ms, noslip, to the end) agree "
             f"on {percent(found['working_agrees_with_reference'])} of the labels; "
-            f"{found['held_at_the_reference_only']} hold at the reference only, "
-            f"{found['held_at_the_working_setting_only']} at the working setting only. How often a setting agrees with "
-            "itself when the wrist is moved tells how sure labels are:\n",
-            table(("moved by", *curves["working"]), moved),
-            f"{timed['grasps']} grasps of {timed['objects']} objects, {percent(timed['hold'])} of which hold, on "
-            f"{timed['threads']} threads (the plain loops on one):\n",
+            f"{found['held_at_the_reference_only']} grasps hold at the reference setting only, "
+            f"{found['held_at_the_working_setting_only']} at the working setting only. The agreement of a setting with "
+            "itself after small displacements of the wrist measures the reliability of labels:\n",
+            table(("displacement", *curves["working"]), moved),
+            f"{timed['grasps']} grasps of {timed['objects']} objects, {percent(timed['hold'])} hold, on "
+            f"{timed['threads']} "
+            "threads (the plain loops on one):\n",
             table(
                 (
                     "trials of the same grasps",
-                    "a second",
+                    "per second",
                     "processor seconds each",
-                    "times the time of working",
-                    "times its processor time",
-                    "labels as working",
+                    "time relative to working",
+                    "processor time relative to working",
+                    "labels equal to working",
                 ),
                 speed,
             ),
-            "Processor seconds of a trial by the size of its batch:\n",
+            "Processor seconds per trial by batch size:\n",
             table(tuple(batches), [tuple(f"{cost:.3f}" for cost in batches.values())]),
             f"The objects of {creep['grasps']} grasps, held for another {creep['seconds']:.0f} s, slide by "
-            f"{slid['median_mm']:.2f} mm in the median; {percent(slid['share_below_2_mm'])} of them by less than "
-            f"2 mm, the farthest by {slid['farthest_mm']:.1f} mm. At the reference setting it is "
-            f"{true['median_mm']:.2f} mm in the median, {percent(true['share_below_2_mm'])} and "
-            f"{true['farthest_mm']:.1f} mm.\n",
-            "Where the time of a step goes once an object is held:\n",
+            f"{slid['median_mm']:.2f} mm in the median; {percent(slid['share_below_2_mm'])} slide by less than 2 mm, "
+            f"and the maximum is {slid['farthest_mm']:.1f} mm. At the reference setting the values are "
+            f"{true['median_mm']:.2f} mm, {percent(true['share_below_2_mm'])} and {true['farthest_mm']:.1f} mm.\n",
+            "Share of the time of a step, with the object held:\n",
             table(tuple(found["profile"]), [tuple(percent(share) for share in found["profile"].values())]),
-            "Grasps by category, and on how many of them the two settings disagree:\n",
+            "Grasps by category, and number of grasps on which the two settings disagree:\n",
             table(("category", "objects", "grasps", "hold", "disagree"), categories),
         ]
     )
@@ -246,16 +252,17 @@ def labels(found: dict[str, Any]) -> str:
 def page() -> str:
     kinematics, collect = read("kinematics"), read("collect")
     parts = [
-        "# Results\n\nWritten by `benchmarks/report.py` from the JSON in `benchmarks/results/`. Intervals are 95 % "
+        "# Results\n\n`benchmarks/report.py` writes this page from the JSON in `benchmarks/results/`. Intervals are "
+        "95 % "
         "bootstrap over scenes.\n",
         evaluators(),
-        "## Refinement\n\nIts own page: [refinement.md](refinement.md).\n",
+        "## Refinement\n\nSee [refinement.md](refinement.md).\n",
         "## Labels\n\n" + labels(read("simulator")),
         f"## The hand\n\n`benchmarks/kinematics.py`, {kinematics['threads']} threads; all links of "
         f"{kinematics['kinematics']['batch']:,} postures, against pytorch_kinematics "
         f"{kinematics['pytorch_kinematics']} in the same run.\n",
         table(
-            ("postures a second", "dexzoo", "pytorch_kinematics", "ratio"),
+            ("postures per second", "dexzoo", "pytorch_kinematics", "ratio"),
             [
                 (
                     name.replace("_", " "),
@@ -267,7 +274,7 @@ def page() -> str:
             ],
         ),
         f"Distances of {kinematics['distances']['grasps']} grasps x {kinematics['distances']['waypoints']} waypoints "
-        f"to {kinematics['distances']['points']:,} points, each other and the table:\n",
+        f"to {kinematics['distances']['points']:,} points, among the links and to the table:\n",
         table(
             ("seconds", "forward", "with gradient"),
             [
@@ -275,10 +282,10 @@ def page() -> str:
                 for name, row in kinematics["distances"]["seconds"].items()
             ],
         ),
-        f"## Collecting\n\n`benchmarks/collect.py`; {collect['scenes']} small scenes with the {collect['generator']} "
+        f"## Collection\n\n`benchmarks/collect.py`; {collect['scenes']} small scenes with the {collect['generator']} "
         f"generator on {collect['processors']} processors.\n",
         table(
-            ("scenes made by", "an hour", "the same files as one worker"),
+            ("scenes made by", "per hour", "same files as with one worker"),
             [
                 (name, f"{value:,.0f}", {True: "yes", False: "no", None: ""}[same])
                 for (name, value), same in zip(
@@ -288,10 +295,11 @@ def page() -> str:
                 )
             ],
         ),
-        f"Two workers over one: {collect['two_over_one']:.2f}. Killed {len(collect['kills'])} times at random moments "
-        "and started again, the collection ended with "
-        f"{'the same' if collect['same_files_as_1_worker']['killed'] else 'other'} files. Grasps loaded a second in "
-        "batches of "
+        f"Speedup with two workers: {collect['two_over_one']:.2f}. After {len(collect['kills'])} kills at random "
+        "moments and "
+        "restarts, the collection ended with "
+        f"{'the same' if collect['same_files_as_1_worker']['killed'] else 'other'} files. Grasps loaded per second, by "
+        "batch size: "
         + ", ".join(f"{size}: {value:,.0f}" for size, value in collect["grasps_loaded_per_second"].items())
         + ".\n",
     ]

@@ -17,12 +17,14 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from dexzoo import plots
-from dexzoo.camera import IMAGE_SIZE, Camera, Observation, colourise
-from dexzoo.sensor import BASELINE, read_depth
+from dexzoo.models.encoders import colorize
+from dexzoo.perception.camera import IMAGE_SIZE, Camera
+from dexzoo.perception.observation import Observation
 from dexzoo.sim import Scene
 from dexzoo.sim.rays import RayCaster
+from dexzoo.sim.sensor import BASELINE, read_depth
 from dexzoo.sim.shapes import make_object
+from dexzoo.viewing import pictures
 
 LIKE_THE_REAL = ("mug", "bowl", "bottle")
 OBJECTS_EACH = 4
@@ -66,7 +68,7 @@ def main() -> None:
         options.out.write_text(text + "\n")
     sys.stdout.write(text + "\n")
     if options.picture:
-        plots.save(picture(options.folder, names, real, options.seed), options.picture)
+        pictures.save(picture(options.folder, names, real, options.seed), options.picture)
 
 
 def load(folder: Path, name: str) -> Frame:
@@ -192,9 +194,9 @@ def holes(frames: list[Frame]) -> dict[str, float]:
     return found
 
 
-def picture(folder: Path, names: list[str], real: list[Frame], seed: int) -> plots.Image:
+def picture(folder: Path, names: list[str], real: list[Frame], seed: int) -> pictures.Image:
     """Rows of real and simulated frames: photograph or ideal depth, depth as read, and the three channels."""
-    cells: list[plots.Image] = []
+    cells: list[pictures.Image] = []
     titles: list[str] = []
     for name, frame in zip(names, real, strict=True):
         observation = Observation(
@@ -205,30 +207,30 @@ def picture(folder: Path, names: list[str], real: list[Frame], seed: int) -> plo
         titles += [f"REAL {name}: photo", "depth as read", *channel_names()]
     for view, name in enumerate(SAMPLES, seed):
         scene = Scene.place(make_object(name), seed + 2)  # where the cup tumbles
-        cells += [plots.depth_picture(scene.observe(view, ideal=True).aimed()), *views(scene.observe(view))]
+        cells += [pictures.depth_picture(scene.observe(view, ideal=True).aimed()), *views(scene.observe(view))]
         titles += [f"SIMULATED {name}: ideal", "depth as read", *channel_names()]
-    return plots.grid(cells, titles, columns=5)
+    return pictures.grid(cells, titles, columns=5)
 
 
 def channel_names() -> list[str]:
     return ["channel 1: depth", "2: mean curvature", "3: Gaussian curvature"]
 
 
-def views(observation: Observation) -> list[plots.Image]:
+def views(observation: Observation) -> list[pictures.Image]:
     """The aimed view, and what an evaluator sees of it."""
     aimed = observation.aimed()
-    channels = colourise(aimed.image()[:1])[0].numpy()
+    channels = colorize(aimed.image()[:1])[0].numpy()
     seen = aimed.mask
     depth = channels[0]
     low, high = depth[seen].min(), depth[seen].max()
-    greys = [np.where(seen, 30 + 200 * (depth - low) / max(high - low, 1e-3), 255)]
+    grays = [np.where(seen, 30 + 200 * (depth - low) / max(high - low, 1e-3), 255)]
     for channel in channels[1:]:
         size = np.quantile(np.abs(channel[seen]), 0.98)
-        greys.append(np.where(seen, 128 + 120 * np.clip(channel / max(size, 1e-6), -1, 1), 255))
-    return [plots.depth_picture(aimed), *(np.repeat(grey[..., None], 3, -1).astype(np.uint8) for grey in greys)]
+        grays.append(np.where(seen, 128 + 120 * np.clip(channel / max(size, 1e-6), -1, 1), 255))
+    return [pictures.depth_picture(aimed), *(np.repeat(gray[..., None], 3, -1).astype(np.uint8) for gray in grays)]
 
 
-def crop(photograph: np.ndarray, mask: np.ndarray) -> plots.Image:
+def crop(photograph: np.ndarray, mask: np.ndarray) -> pictures.Image:
     """A square around the object."""
     rows, columns = np.nonzero(mask)
     half = 150

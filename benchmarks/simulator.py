@@ -2,7 +2,7 @@
 
 python benchmarks/simulator.py --out benchmarks/results/simulator.json
 Every `--every`-th object of each category is placed and seen; grasps of the first generator that finds any that hold,
-and neighbours of those, are tried, and up to `--num_grasps` an object are kept, half of which hold where there are so
+and neighbors of those, are tried, and up to `--num_grasps` an object are kept, half of which hold where there are so
 many. Each is tried at the working and at the reference setting, and again with the wrist moved by 0.1, 1 and 3 mm (the
 reference by 1 and 3 mm on the first object of a category only). `--folder` keeps what is done, so that a run can be
 continued; then the clock is taken on the first object of eight categories where any holds, against plain loops over one
@@ -14,6 +14,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -22,10 +23,10 @@ import torch
 
 from dexzoo.generators import make_generator
 from dexzoo.grasp import Grasps
-from dexzoo.hand import default_hand
+from dexzoo.hand import Hand
 from dexzoo.sim import Scene, trial
 from dexzoo.sim.execution import Execution
-from dexzoo.sim.motion import END, LIFT_START
+from dexzoo.sim.protocol import END, LIFT_START
 from dexzoo.sim.shapes import make_object, object_names
 from dexzoo.sim.world import REFERENCE, WORKING, Physics
 
@@ -36,7 +37,7 @@ UNIFORM = Physics(0.002, 10, 0.002, 10)
 NUM_TIMED = 8
 COPIES = 4
 """How often the working setting is timed on each grasp of an object, in one batch."""
-HAND = default_hand()
+HAND = Hand.load()
 Row = dict[str, np.ndarray]
 
 
@@ -59,10 +60,10 @@ def main() -> None:
             np.savez(path, **measure(name, options.num_grasps, options.generators, thorough=number(name) == 0))
             sys.stderr.write(f"{name}\n")
     rows = {name: dict(np.load(options.folder / f"{name}.npz")) for name in names}
-    held = {name: row for name, row in rows.items() if len(row["waypoints"]) and row["working"].any()}
+    held = {name: row for name, row in rows.items() if len(row["grasp_type"]) and row["working"].any()}
     firsts = {category(name): name for name in reversed(held)}.values()  # the first of each category
     timed = {name: held[name] for name in list(firsts)[:NUM_TIMED]}
-    result = summarise(rows) | speed(timed) | growth(timed) | {"creep": creep(timed), "profile": profile(timed)}
+    result = summarize(rows) | speed(timed) | growth(timed) | {"creep": creep(timed), "profile": profile(timed)}
     text = json.dumps(result, indent=2)
     if options.out:
         options.out.write_text(text + "\n")
@@ -88,20 +89,25 @@ def measure(name: str, num: int, generators: list[str], thorough: bool) -> Row:
         grasps = candidates(scene, num, generators)
     except ValueError as error:
         sys.stderr.write(f"{error}\n")
-        grasps = Grasps(torch.zeros(0, 10, 28), "world")
-    out = {"waypoints": grasps.waypoints.numpy()}
+        grasps = Grasps.none(HAND)
+    out = {name: getattr(grasps, name).numpy() for name in ("wrist", "joints", "grasp_type")}
     if not len(grasps):
         return out
-    outcomes = trial.run(scene, grasps, HAND)
+    outcomes = trial.run(scene, grasps)
     out |= {"working": outcomes.success, "unstable": outcomes.unstable}
-    out["reference"] = trial.run(scene, grasps, HAND, physics=REFERENCE).success
+    out["reference"] = trial.run(scene, grasps, physics=REFERENCE).success
     rng = np.random.default_rng(0)
     for offset in OFFSETS:
         near = moved(grasps, offset, rng)
-        out[f"working {offset}"] = trial.run(scene, near, HAND).success
+        out[f"working {offset}"] = trial.run(scene, near).success
         if thorough or offset == OFFSETS[0]:
-            out[f"reference {offset}"] = trial.run(scene, near, HAND, physics=REFERENCE).success
+            out[f"reference {offset}"] = trial.run(scene, near, physics=REFERENCE).success
     return out
+
+
+def grasps_of(row: Row) -> Grasps:
+    """The grasps that a row keeps."""
+    return Grasps(*(torch.tensor(row[name]) for name in ("wrist", "joints", "grasp_type")), HAND)
 
 
 def elapsed(start: tuple[float, float]) -> np.ndarray:
@@ -110,23 +116,22 @@ def elapsed(start: tuple[float, float]) -> np.ndarray:
 
 
 def candidates(scene: Scene, num: int, generators: list[str]) -> Grasps:
-    """Grasps of which about half hold: of the first generator with such, and neighbours at 1 cm of those that hold."""
+    """Grasps of which about half hold: of the first generator with such, and neighbors at 1 cm of those that hold."""
     rng = np.random.default_rng(0)
     observation = scene.observe(seed=0)
     for name in generators:
         try:
-            generated = make_generator(name).generate(observation, 4 * num, seed=0)
+            grasps = make_generator(name, HAND).generate(observation, 4 * num, seed=0)
         except RuntimeError as error:
             sys.stderr.write(f"{scene.object.name}, {name}: {error}\n")
             continue
-        grasps = Grasps(generated.to_frame("world", scene.T_world_camera).waypoints, "world")
-        outcomes = trial.run(scene, grasps, HAND)
+        outcomes = trial.run(scene, grasps)
         if outcomes.success.any():
             break
     else:
-        return Grasps(torch.zeros(0, 10, 28), "world")
+        return Grasps.none(HAND)
     near = moved(grasps[rng.choice(np.flatnonzero(outcomes.success), 2 * num)], 0.01, rng)
-    outcomes = trial.Outcomes.concatenate([outcomes, trial.run(scene, near, HAND)])
+    outcomes = trial.Outcomes.concatenate([outcomes, trial.run(scene, near)])
     tried = ~outcomes.collided & ~outcomes.starts_inside & ~outcomes.unstable
     held, failed = (np.flatnonzero(tried & (outcomes.success == holds)) for holds in (True, False))
     chosen = np.concatenate((rng.permutation(held)[: num // 2], rng.permutation(failed)[: num - num // 2]))
@@ -135,16 +140,16 @@ def candidates(scene: Scene, num: int, generators: list[str]) -> Grasps:
 
 def moved(grasps: Grasps, offset: float, rng: np.random.Generator) -> Grasps:
     step = rng.normal(size=(len(grasps), 1, 3))
-    waypoints = grasps.waypoints.clone()
-    waypoints[..., :3] += torch.tensor(offset * step / np.linalg.norm(step, axis=-1, keepdims=True)).float()
-    return Grasps(waypoints, "world")
+    wrist = grasps.wrist.clone()
+    wrist[..., :3] += torch.tensor(offset * step / np.linalg.norm(step, axis=-1, keepdims=True)).float()
+    return replace(grasps, wrist=wrist, log_likelihood=None)
 
 
 def plain_loop(scene: Scene, grasps: Grasps, physics: Physics) -> np.ndarray:
     """Which grasps hold by MuJoCo's own step, one after another and each to its end."""
     model = scene.model(HAND.spec, physics)
     data = mujoco.MjData(model)
-    start = Execution(scene, grasps, HAND, model, physics)
+    start = Execution(scene, grasps, model, physics)
     closing = np.arange(1, round(LIFT_START / physics.timestep) + 1) * physics.timestep
     carrying = np.arange(1, round((END - LIFT_START) / physics.carry_timestep) + 1) * physics.carry_timestep
     wrist, turn, joints = start.motion.at(np.concatenate((closing, LIFT_START + carrying)), start.everyone)
@@ -165,15 +170,15 @@ def plain_loop(scene: Scene, grasps: Grasps, physics: Physics) -> np.ndarray:
     return held
 
 
-def summarise(rows: dict[str, Row]) -> dict[str, object]:
+def summarize(rows: dict[str, Row]) -> dict[str, object]:
     """How the settings agree with each other, and each with itself when the wrist is moved."""
-    found = [row for row in rows.values() if len(row["waypoints"])]
+    found = [row for row in rows.values() if len(row["grasp_type"])]
     labels = {key: np.concatenate([row[key] for row in found]) for key in ("working", "reference", "unstable")}
     per_category: dict[str, dict[str, int]] = {}
     for name, row in rows.items():
         counts = per_category.setdefault(category(name), {"objects": 0, "grasps": 0, "hold": 0, "disagree": 0})
         counts["objects"] += 1
-        if len(row["waypoints"]):
+        if len(row["grasp_type"]):
             counts["grasps"] += len(row["working"])
             counts["hold"] += int(row["working"].sum())
             counts["disagree"] += int((row["working"] != row["reference"]).sum())
@@ -205,11 +210,11 @@ def speed(rows: dict[str, Row]) -> dict[str, object]:
     processor, wall = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
     same: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for name, row in rows.items():
-        scene, grasps = scene_of(name), Grasps(torch.tensor(row["waypoints"]), "world")
+        scene, grasps = scene_of(name), grasps_of(row)
         many = grasps[np.tile(np.arange(len(grasps)), COPIES)]
         ways = (
-            lambda scene=scene, many=many: trial.run(scene, many, HAND).success,
-            lambda scene=scene, grasps=grasps: trial.run(scene, grasps, HAND, physics=REFERENCE).success,
+            lambda scene=scene, many=many: trial.run(scene, many).success,
+            lambda scene=scene, grasps=grasps: trial.run(scene, grasps, physics=REFERENCE).success,
             lambda scene=scene, grasps=grasps: plain_loop(scene, grasps, WORKING),
             lambda scene=scene, grasps=grasps: plain_loop(scene, grasps, UNIFORM),
         )
@@ -220,7 +225,7 @@ def speed(rows: dict[str, Row]) -> dict[str, object]:
             processor[key] += spent[0]
             wall[key] += spent[1]
             same[key].append(held == np.resize(row["working"], len(held)))
-    count = sum(len(row["waypoints"]) for row in rows.values())
+    count = sum(len(row["grasp_type"]) for row in rows.values())
     return {
         "timed": {
             "objects": len(rows),
@@ -243,13 +248,13 @@ def speed(rows: dict[str, Row]) -> dict[str, object]:
 def growth(rows: dict[str, Row]) -> dict[str, object]:
     """Processor time of a trial in batches of more and more copies of one object's grasps."""
     name, row = next((name, row) for name, row in rows.items() if 0.4 < row["working"].mean() < 0.6)
-    scene, waypoints = scene_of(name), torch.tensor(row["waypoints"])
+    scene, grasps = scene_of(name), grasps_of(row)
     cost = {}
     for size in BATCHES:
-        many = Grasps(waypoints[torch.arange(max(size, 100)) % len(waypoints)], "world")  # the same mix for each size
+        many = grasps[torch.arange(max(size, 100)) % len(grasps)]  # the same mix for each size
         start = time.process_time(), time.perf_counter()
         for first in range(0, len(many), size):
-            trial.run(scene, many[first : first + size], HAND)
+            trial.run(scene, many[first : first + size])
         cost[str(size)] = elapsed(start)[0] / len(many)
     return {"processor_seconds_per_trial_in_batches_of": cost}
 
@@ -261,9 +266,9 @@ def creep(rows: dict[str, Row], seconds: float = 10.0) -> dict[str, object]:
     """
     slid: dict[str, list[np.ndarray]] = {"working": [], "reference": []}
     for name, row in rows.items():
-        scene, grasps = scene_of(name), Grasps(torch.tensor(row["waypoints"][row["working"]]), "world")
+        scene, grasps = scene_of(name), grasps_of(row)[row["working"]]
         for setting, physics in (("working", WORKING), ("reference", REFERENCE)):
-            execution = Execution(scene, grasps, HAND, scene.model(HAND.spec, physics), physics)
+            execution = Execution(scene, grasps, scene.model(HAND.spec, physics), physics)
             for time_reached in (LIFT_START, END):
                 execution.advance(execution.everyone, time_reached)
             before = execution.in_palm(execution.everyone)
@@ -299,8 +304,8 @@ def profile(rows: dict[str, Row]) -> dict[str, float]:
     spent = dict.fromkeys(timers, 0.0)
     for name, row in rows.items():
         scene = scene_of(name)
-        grasp = Grasps(torch.tensor(row["waypoints"][row["working"]][:1]), "world")
-        execution = Execution(scene, grasp, HAND, scene.model(HAND.spec), WORKING)
+        grasp = grasps_of(row)[row["working"]][:1]
+        execution = Execution(scene, grasp, scene.model(HAND.spec), WORKING)
         data, model = mujoco.MjData(execution.batch.model), execution.batch.model
         execution.advance(execution.everyone, LIFT_START)
         execution.batch.get_data(0, data)

@@ -1,4 +1,4 @@
-"""What benchmarks/report.py writes figures with: reading results, rounding, tables."""
+"""Shared by the scripts that write figures into the docs: reading of results, rounding, tables."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ def read(name: str) -> dict[str, Any]:
 
 
 def with_figures(text: str, figures: str) -> str:
-    """The text with what stands between the markers replaced."""
+    """The text with the part between the markers replaced."""
     before, rest = text.split(BEGIN)
     return f"{before}{BEGIN}\n{figures}{END}{rest.split(END)[1]}"
 

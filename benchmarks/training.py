@@ -16,15 +16,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.nn import functional as F
 
 import dexzoo
-from dexzoo.comparison.scores import processor
-from dexzoo.data.datamodule import Draw, GraspDataModule
+from dexzoo.collection.rendering import render
+from dexzoo.comparison.scores import one_view, processor
+from dexzoo.data.batches import Draw
+from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.grasp import Trajectory
+from dexzoo.models.batch import Batch
 from dexzoo.models.em2 import EM2
 from dexzoo.models.encoders import fast_bfloat16
-from dexzoo.models.evaluator import CHUNK, Batch
+from dexzoo.models.evaluator import CHUNK
 
 KEPT_STEPS, TRUNK_STEPS = 16, 2
 NUM_VIEWS = 16
@@ -39,6 +42,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     data = GraspDataModule(options.data, num_scenes=NUM_SCENES)
+    data.renderer = render
     machine = {"threads": torch.get_num_threads(), "processor": processor()}
     result = machine | {"training": training(data), "scoring": scoring(data)}
     text = json.dumps(result, indent=2)
@@ -92,16 +96,16 @@ def scoring(data: GraspDataModule) -> dict[str, Any]:
     """Processor seconds for 1,000 grasps on one view, at once and pair by pair."""
     model = dexzoo.load("em2")
     image = data.source.images([0])[torch.tensor([0])]
-    grasps = data.waypoints[torch.arange(NUM_GRASPS) % len(data.waypoints)]
+    grasps = data.aimed_grasps[torch.arange(NUM_GRASPS) % len(data.aimed_grasps)]
 
     @torch.no_grad()
-    def score(part: Tensor) -> None:
-        scene = model.encode(image)
+    def score(part: Trajectory) -> None:
+        encoding = model.encode(image)
         for some in part.split(CHUNK):
-            model.logit(scene, some[None])
+            model.logit(encoding, one_view(some))
 
     once = seconds(score, [grasps])
-    pairs = NUM_GRASPS / NUM_PAIRS * seconds(score, list(grasps[:NUM_PAIRS].split(1)))
+    pairs = NUM_GRASPS / NUM_PAIRS * seconds(score, grasps[:NUM_PAIRS].split(1))
     return {"seconds_for_1000_grasps": {"view encoded once": once, "pair by pair": pairs}, "ratio": pairs / once}
 
 

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import torch
 
-from dexzoo.camera import Camera
+from dexzoo.perception.camera import Camera
 from dexzoo.sim import Scene
 from dexzoo.sim.robot import to_quaternion
 from dexzoo.sim.shapes import NUM_OBJECTS, make_object

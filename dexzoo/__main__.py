@@ -2,6 +2,6 @@
 
 import sys
 
-from dexzoo.cli import main
+from dexzoo.cli.main import main
 
 sys.exit(main())

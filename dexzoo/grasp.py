@@ -1,107 +1,82 @@
 """Grasps and the conventions that everything else follows.
 
-- Metres, radians, kilograms, newtons, seconds. Right-handed frames. `T_a_b` maps coordinates in b to a.
-- Quaternions are wxyz, unit, w >= 0.
-- World: the table top is z = 0, z points up. Camera: x right, y down, z forward (OpenCV); depth is z in metres,
-  and 0 or NaN means no reading.
+- Units are meters, radians, kilograms, newtons and seconds. Frames are right-handed. `T_a_b` maps coordinates in frame
+  b to frame a.
+- Quaternions are wxyz, unit, with w >= 0.
+- World frame: the table top is z = 0 and z points up. Grasps are in the world frame of the observation or the scene
+  that they belong to. `Grasps.transformed` converts them where they leave or enter the program.
+- Camera frame: x right, y down, z forward (OpenCV). Depth is z in meters; 0 or NaN means no reading.
 - Wrist frame = palm frame: +x out of the palm, +y to the thumb side, +z to the fingers.
-- Joints: thumb, index, middle, ring, little x (abd, mcp, pip, dip); dip = pip, so 20 angles and 15 freedoms.
-- A grasp is 10 waypoints x 28 numbers: wrist position 0:3, wrist quaternion 3:7, joints 7:27, grasp type 27 (an
-  index 0...9, the same in all ten). Waypoint 0 is the pre-grasp, waypoint 6 the grip, waypoint 9 the squeeze.
-  Waypoints are equally spaced on each leg of the path: positions and joints linear, orientation slerp.
-- Grasp sets hold grasps in the world frame; `generate` and `plan` give them in the camera frame, and a file says which
-  it is. `score` and `refine` take either; an architecture's `logit` gets them in the frame of the aimed camera.
+- Joints are in the order of `hand.joint_names`. Coupled joints have their own angle: the DLR/HIT hand II has 20 angles
+  (thumb, index, middle, ring, little x abd, mcp, pip, dip) and 15 degrees of freedom.
+- A grasp is ten waypoints of the wrist and the joints, and a grasp type. Waypoint 0 is the pre-grasp, waypoint 6 the
+  grip (first full contact) and waypoint 9 the squeeze. Waypoints are equally spaced on each leg of the path: positions
+  and joints linear, orientation slerp.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
 from dexzoo import rotation
+from dexzoo.hand import Hand
 
 NUM_WAYPOINTS = 10
 PREGRASP, GRIP, SQUEEZE = 0, 6, 9
 """Waypoint indices of the pre-grasp, the grip (first full contact) and the squeeze."""
-NUM_JOINTS = 20
+KEYFRAMES = [PREGRASP, GRIP, SQUEEZE]
 GRASP_TYPES = (
     "power", "power_tube", "pinch", "pinch_support", "rim", "handle", "tripod", "lateral", "top", "edge",
 )  # fmt: skip
-"""Names of the grasp types; number 27 of a waypoint is the index into them."""
+"""Names of the grasp types; a grasp stores the index."""
 NUM_TYPES = len(GRASP_TYPES)
-WAYPOINT_SIZE = 28
-POSITION, QUATERNION, JOINTS, TYPE = slice(0, 3), slice(3, 7), slice(7, 27), 27
-"""Where the parts of a waypoint stand among its 28 numbers."""
-
-Frame = Literal["world", "camera"]
+FORMAT = "dexzoo.grasps.2"
+Kind = TypeVar("Kind", bound="Trajectory")
+Index = Tensor | slice | Sequence[int] | np.ndarray | np.integer[Any] | int
 
 
 @dataclass(frozen=True)
-class Grasps:
-    """Any number of grasps in one frame.
+class Trajectory:
+    """Motion of the hand through the waypoints of any number of grasps, in one frame. Values are not checked.
 
-    waypoints: (num_grasps, 10, 28), laid out as the module's docstring says.
-    frame: "world" or "camera".
-    log_likelihood: (num_grasps,) under the generator that proposed them, or None.
-
-    Quaternions are stored with w >= 0, whichever of the two signs is given.
-    Raises ValueError when the shape is wrong, a number is not finite, a quaternion is not unit, or a grasp type is
-    none of 0...9.
+    Attributes:
+        wrist: Wrist poses, position in meters and quaternion wxyz, (*batch, waypoint, 7).
+        joints: Joint angles in radians, (*batch, waypoint, joint).
+        grasp_type: Index into `GRASP_TYPES`, (*batch,).
     """
 
-    waypoints: Float[Tensor, "grasp 10 28"]
-    frame: Frame
-    log_likelihood: Float[Tensor, " grasp"] | None = None
-
-    def __post_init__(self) -> None:
-        w = self.waypoints
-        if w.ndim != 3 or w.shape[1:] != (NUM_WAYPOINTS, WAYPOINT_SIZE):
-            raise ValueError(f"grasps have shape {tuple(w.shape)}, expected (num_grasps, 10, 28)")
-        if self.frame not in ("world", "camera"):
-            raise ValueError(f'grasp frame {self.frame!r} is unknown, use "world" or "camera"')
-        if not torch.isfinite(w).all():
-            bad = int((~torch.isfinite(w)).flatten(1).any(1).nonzero()[0])
-            raise ValueError(f"grasp {bad} holds a number that is not finite")
-        error = (w[..., QUATERNION].norm(dim=-1) - 1).abs()
-        if error.numel() and error.max() > 1e-3:
-            grasp, waypoint = divmod(int(error.argmax()), NUM_WAYPOINTS)
-            raise ValueError(
-                f"quaternion of grasp {grasp}, waypoint {waypoint} has length "
-                f"{float(w[grasp, waypoint, QUATERNION].norm()):.3f}, expected 1 (wxyz at 3:7)"
-            )
-        types = w[..., TYPE].round()
-        if ((types < 0) | (types >= NUM_TYPES)).any():
-            bad = int(((types < 0) | (types >= NUM_TYPES)).any(1).nonzero()[0])
-            raise ValueError(f"grasp {bad} has the type {float(w[bad, 0, TYPE]):g}, expected 0 to 9 (number 27)")
-        if (w[..., 3] < 0).any():
-            quaternion = torch.where(w[..., 3:4] < 0, -w[..., QUATERNION], w[..., QUATERNION])
-            object.__setattr__(self, "waypoints", torch.cat((w[..., POSITION], quaternion, w[..., 7:]), dim=-1))
-        if self.log_likelihood is not None and self.log_likelihood.shape != w.shape[:1]:
-            raise ValueError(
-                f"log_likelihood has shape {tuple(self.log_likelihood.shape)}, expected ({w.shape[0]},) for the grasps"
-            )
+    wrist: Float[Tensor, "*batch waypoint 7"]
+    joints: Float[Tensor, "*batch waypoint joint"]
+    grasp_type: Int[Tensor, "*batch"]
 
     @classmethod
     def from_keyframes(
         cls,
         position: Float[Tensor, "grasp 3 3"],
         quaternion: Float[Tensor, "grasp 3 4"],
-        joints: Float[Tensor, "grasp 3 20"],
-        grasp_type: Tensor,
-        frame: Frame,
-        log_likelihood: Float[Tensor, " grasp"] | None = None,
-    ) -> Grasps:
-        """Grasps from their pre-grasp, grip and squeeze (dimension 1, in this order); differentiable.
+        joints: Float[Tensor, "grasp 3 joint"],
+        grasp_type: Int[Tensor, " grasp"],
+    ) -> Trajectory:
+        """Interpolate the ten waypoints between pre-grasp, grip and squeeze; differentiable.
 
-        grasp_type: (num_grasps,) indices 0...9.
+        Args:
+            position: Wrist positions in meters at the three keyframes.
+            quaternion: Wrist orientations, wxyz.
+            joints: Angles of all joints in radians.
+            grasp_type: Index into `GRASP_TYPES`.
+
+        Returns:
+            The trajectories, in the frame of the keyframes.
         """
         t = torch.linspace(0, 1, GRIP + 1, dtype=position.dtype, device=position.device)
         s = torch.linspace(0, 1, SQUEEZE - GRIP + 1, dtype=position.dtype, device=position.device)[1:]
@@ -111,141 +86,308 @@ class Grasps:
             return torch.cat((a + t[:, None] * (b - a), b + s[:, None] * (c - b)), dim=1)
 
         a, b, c = (quaternion[:, i, None] for i in range(3))
-        turned = torch.cat(
-            (
-                rotation.slerp(a, b, t.expand(len(position), -1)),
-                rotation.slerp(b, c, s.expand(len(position), -1)),
-            ),
-            dim=1,
-        )
-        types = grasp_type.to(position)[:, None, None].expand(-1, NUM_WAYPOINTS, 1)
-        return cls(torch.cat((blend(position), turned, blend(joints), types), -1), frame, log_likelihood)
+        approach = rotation.slerp(a, b, t.expand(len(position), -1))
+        squeeze = rotation.slerp(b, c, s.expand(len(position), -1))
+        wrist = torch.cat((blend(position), torch.cat((approach, squeeze), dim=1)), dim=-1)
+        return Trajectory(wrist, blend(joints), grasp_type)
 
     @classmethod
-    def concatenate(cls, parts: list[Grasps]) -> Grasps:
-        """All grasps of parts in the same frame, in order. The likelihood is kept if every part has one."""
-        if len({part.frame for part in parts}) != 1:
-            raise ValueError("grasps to concatenate must share one frame; use to_frame first")
-        likelihoods = [part.log_likelihood for part in parts]
-        known = [value for value in likelihoods if value is not None]
-        joined = torch.cat(known) if len(known) == len(parts) else None
-        return cls(torch.cat([part.waypoints for part in parts]), parts[0].frame, joined)
+    def cat(cls, parts: Sequence[Trajectory], dim: int = 0) -> Trajectory:
+        """Join trajectories along a dimension that is there.
+
+        Args:
+            parts: Trajectories; at least one.
+            dim: A batch dimension.
+        """
+        return cls._join(torch.cat, parts, dim)
+
+    @classmethod
+    def stack(cls, parts: Sequence[Trajectory]) -> Trajectory:
+        """Join trajectories along a new first dimension.
+
+        Args:
+            parts: Trajectories; at least one.
+        """
+        return cls._join(torch.stack, parts, 0)
+
+    @staticmethod
+    def _join(function: Any, parts: Sequence[Trajectory], dim: int) -> Trajectory:  # noqa: ANN401, one of torch's
+        names = ("wrist", "joints", "grasp_type")
+        return Trajectory(*(function([getattr(part, name) for part in parts], dim) for name in names))
+
+    @property
+    def position(self) -> Float[Tensor, "*batch waypoint 3"]:
+        """Wrist positions in meters."""
+        return self.wrist[..., :3]
+
+    @property
+    def quaternion(self) -> Float[Tensor, "*batch waypoint 4"]:
+        """Wrist orientations, wxyz."""
+        return self.wrist[..., 3:]
+
+    @property
+    def wrist_pose(self) -> Float[Tensor, "*batch waypoint 4 4"]:
+        """Wrist poses as homogeneous matrices."""
+        return rotation.pose_matrix(self.position, self.quaternion)
 
     def __len__(self) -> int:
-        return self.waypoints.shape[0]
+        return len(self.wrist)
 
-    def __getitem__(self, index: Tensor | slice | list[int] | np.ndarray | np.integer[Any] | int) -> Grasps:
-        """A subset, as Grasps: by slice, mask, list, order of indices, or one index."""
+    def __getitem__(self: Kind, index: Index) -> Kind:
+        """A subset along the first dimension: by slice, mask, list, order of indices, or one index."""
         if isinstance(index, np.ndarray):
             index = torch.as_tensor(index)
         if isinstance(index, (int, np.integer)) or (isinstance(index, Tensor) and not index.ndim):
             index = [int(index)]
-        likelihood = None if self.log_likelihood is None else self.log_likelihood[index]
-        return replace(self, waypoints=self.waypoints[index], log_likelihood=likelihood)
+        return self._map(lambda value: value[index])
 
-    @property
-    def position(self) -> Float[Tensor, "grasp 10 3"]:
-        """Wrist positions, metres."""
-        return self.waypoints[..., POSITION]
+    def waypoint(self, index: int | Sequence[int]) -> Trajectory:
+        """The motion at some waypoints only; the dimension `waypoint` stays.
 
-    @property
-    def quaternion(self) -> Float[Tensor, "grasp 10 4"]:
-        """Wrist orientations, wxyz."""
-        return self.waypoints[..., QUATERNION]
+        Args:
+            index: One waypoint, or several in order.
+        """
+        rows = [index] if isinstance(index, int) else list(index)
+        return Trajectory(self.wrist[..., rows, :], self.joints[..., rows, :], self.grasp_type)
 
-    @property
-    def joints(self) -> Float[Tensor, "grasp 10 20"]:
-        """Joint angles, radians."""
-        return self.waypoints[..., JOINTS]
+    def transformed(self: Kind, T_a_b: Float[Tensor, "*pose 4 4"] | np.ndarray) -> Kind:
+        """Express trajectories that are given in frame b in frame a.
 
-    @property
-    def grasp_type(self) -> Tensor:
-        """(num_grasps,) integer grasp types 0...9."""
-        return self.waypoints[:, 0, TYPE].round().long()
+        Args:
+            T_a_b: Pose of frame b in frame a: one for all grasps, or one for each.
 
-    @property
-    def wrist_pose(self) -> Float[Tensor, "grasp 10 4 4"]:
-        """Wrist poses as homogeneous matrices T_frame_wrist."""
-        return pose_matrix(self.position, self.quaternion)
+        Returns:
+            The same trajectories in frame a.
+        """
+        T = torch.as_tensor(T_a_b).to(self.wrist)[..., None, :, :]
+        position = (T[..., :3, :3] @ self.position[..., None]).squeeze(-1) + T[..., :3, 3]
+        turn = rotation.from_matrix(T[..., :3, :3])
+        quaternion = rotation.multiply(*torch.broadcast_tensors(turn, self.quaternion))
+        return replace(self, wrist=torch.cat((position, rotation.normalize(quaternion)), dim=-1))
 
-    def to_frame(self, frame: Frame, T_world_camera: Tensor | np.ndarray) -> Grasps:
-        """The same grasps in "world" or "camera", given the pose of the camera in the world, (4, 4)."""
-        if frame == self.frame:
-            return self
-        T = rotation.check_pose(T_world_camera, "T_world_camera")
-        if frame == "camera":
-            T = torch.linalg.inv(T)
-        return replace(self, waypoints=transform_waypoints(T.to(self.waypoints), self.waypoints), frame=frame)
+    def to(self: Kind, *args: Any, **kwargs: Any) -> Kind:  # noqa: ANN401, as torch's own
+        """Move to a device or a floating-point type; grasp types stay integers.
 
-    def moved(self, motion: Tensor | np.ndarray) -> Grasps:
-        """The grasps carried along by a rigid motion (4, 4) within their frame, as when the object under them moves."""
-        T = rotation.check_pose(motion, "motion").to(self.waypoints)
-        return replace(self, waypoints=transform_waypoints(T, self.waypoints))
+        Args:
+            args: Arguments of `torch.Tensor.to`.
+            kwargs: Keywords of `torch.Tensor.to`.
+        """
 
-    def save(self, path: str | Path) -> None:
-        """Write to a safetensors file, frame included."""
-        tensors = {"waypoints": self.waypoints.detach().float().contiguous()}
-        if self.log_likelihood is not None:
-            tensors["log_likelihood"] = self.log_likelihood.detach().float().contiguous()
-        save_file(tensors, str(path), metadata={"frame": self.frame, "format": "dexzoo.grasps.1"})
+        def move(value: Tensor) -> Tensor:
+            moved = value.to(*args, **kwargs)
+            return moved if value.is_floating_point() else moved.to(value.dtype)
+
+        return self._map(move)
+
+    def detach(self: Kind) -> Kind:
+        """The same values without their gradient."""
+        return self._map(Tensor.detach)
+
+    def split(self: Kind, size: int) -> list[Kind]:
+        """Consecutive parts of at most `size` grasps; one empty part if there are none, as `torch.split` has it.
+
+        Args:
+            size: Largest number of grasps in a part.
+        """
+        return [self[start : start + size] for start in range(0, max(len(self), 1), size)]
+
+    def _map(self: Kind, function: Any) -> Kind:  # noqa: ANN401, any function of tensors
+        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: function(v) for name, v in tensors.items() if isinstance(v, Tensor)})
+
+
+@dataclass(frozen=True)
+class Grasps(Trajectory):
+    """Grasps of one hand, in the world frame of the observation or scene that they belong to.
+
+    Quaternions are stored with w >= 0, whichever sign is given.
+
+    Attributes:
+        wrist: Wrist poses, position in meters and quaternion wxyz, (grasp, 10, 7).
+        joints: Joint angles in radians, in the order of `hand.joint_names`, (grasp, 10, joint).
+        grasp_type: Index into `GRASP_TYPES`, (grasp,).
+        hand: The hand whose wrist and joints these are.
+        log_likelihood: Log-likelihood under the generator that proposed the grasps, (grasp,), or None.
+
+    Raises:
+        ValueError: A shape is wrong, a number is not finite, a quaternion is not unit, or a grasp type is unknown.
+    """
+
+    hand: Hand
+    log_likelihood: Float[Tensor, " grasp"] | None = None
+
+    def __post_init__(self) -> None:
+        joints = len(self.hand.joint_names)
+        count = len(self.wrist) if self.wrist.ndim else 0
+        expected = {
+            "wrist": (count, NUM_WAYPOINTS, 7),
+            "joints": (count, NUM_WAYPOINTS, joints),
+            "grasp_type": (count,),
+            "log_likelihood": (count,),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                wanted = f"(num_grasps, {NUM_WAYPOINTS}, 7)" if name == "wrist" else shape
+                raise ValueError(f"{name} of grasps has shape {tuple(value.shape)}, expected {wanted}")
+        for name in ("wrist", "joints"):
+            finite = torch.isfinite(getattr(self, name)).flatten(1).all(1)
+            if not finite.all():
+                raise ValueError(f"{name} of grasp {int((~finite).nonzero()[0])} holds a number that is not finite")
+        length = self.quaternion.norm(dim=-1)
+        if count and (length - 1).abs().max() > 1e-3:
+            grasp, waypoint = divmod(int((length - 1).abs().argmax()), NUM_WAYPOINTS)
+            raise ValueError(
+                f"quaternion of grasp {grasp}, waypoint {waypoint} has length "
+                f"{float(length[grasp, waypoint]):.3f}, expected 1 (wxyz at 3:7 of wrist)"
+            )
+        unknown = (self.grasp_type < 0) | (self.grasp_type >= NUM_TYPES)
+        if unknown.any():
+            row = int(unknown.nonzero()[0])
+            raise ValueError(f"grasp {row} has the type {int(self.grasp_type[row])}, expected 0 to {NUM_TYPES - 1}")
+        if (self.wrist[..., 3] < 0).any():
+            sign = torch.where(self.wrist[..., 3:4] < 0, -1.0, 1.0)
+            object.__setattr__(self, "wrist", torch.cat((self.position, sign * self.quaternion), dim=-1))
 
     @classmethod
-    def load(cls, path: str | Path) -> Grasps:
-        """Read what `save` wrote. FileNotFoundError or ValueError when that is not possible."""
+    def of(cls, trajectory: Trajectory, hand: Hand, log_likelihood: Float[Tensor, " grasp"] | None = None) -> Grasps:
+        """Check trajectories in the world frame and make grasps of them.
+
+        Args:
+            trajectory: Trajectories, (grasp,).
+            hand: The hand that they are of.
+            log_likelihood: As in `Grasps`.
+
+        Returns:
+            The grasps.
+
+        Raises:
+            ValueError: As in `Grasps`.
+        """
+        return cls(trajectory.wrist, trajectory.joints, trajectory.grasp_type, hand, log_likelihood)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion alone, without hand and likelihood."""
+        return Trajectory(self.wrist, self.joints, self.grasp_type)
+
+    def transformed(self: Kind, T_a_b: Float[Tensor, "*pose 4 4"] | np.ndarray) -> Kind:
+        """Express grasps that are given in frame b in frame a.
+
+        Args:
+            T_a_b: Pose of frame b in frame a: one for all grasps, or one for each.
+
+        Returns:
+            The same grasps in frame a.
+
+        Raises:
+            ValueError: A single pose is no rigid motion.
+        """
+        return super().transformed(rotation.check_pose(T_a_b, "T_a_b") if np.ndim(T_a_b) == 2 else T_a_b)
+
+    @classmethod
+    def none(cls, hand: Hand) -> Grasps:
+        """No grasps.
+
+        Args:
+            hand: The hand of which there are none.
+        """
+        joints = torch.zeros(0, NUM_WAYPOINTS, len(hand.joint_names))
+        return cls(torch.zeros(0, NUM_WAYPOINTS, 7), joints, torch.zeros(0, dtype=torch.long), hand)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Grasps]) -> Grasps:
+        """All grasps of some parts in order.
+
+        Args:
+            parts: Grasps of one hand in one world frame; at least one part.
+
+        Returns:
+            The grasps; their log-likelihood is kept if every part has one.
+
+        Raises:
+            ValueError: The parts are of different hands.
+        """
+        if len({part.hand.digest for part in parts}) != 1:
+            raise ValueError("grasps to concatenate must be of one hand")
+        known = [part.log_likelihood for part in parts if part.log_likelihood is not None]
+        likelihood = torch.cat(known) if len(known) == len(parts) else None
+        return cls.of(Trajectory.cat(parts), parts[0].hand, likelihood)
+
+    def save(self, path: str | Path) -> None:
+        """Write to a safetensors file, with the hand's name, side and digest.
+
+        Args:
+            path: File to write.
+        """
+        tensors = {
+            "wrist": self.wrist.detach().cpu().float().contiguous(),
+            "joints": self.joints.detach().cpu().float().contiguous(),
+            "grasp_type": self.grasp_type.cpu().contiguous(),
+        }
+        if self.log_likelihood is not None:
+            tensors["log_likelihood"] = self.log_likelihood.detach().cpu().float().contiguous()
+        save_file(tensors, str(path), metadata={"format": FORMAT, "frame": "world", **self.hand.identity})
+
+    @classmethod
+    def load(cls, path: str | Path, hand: Hand | None = None) -> Grasps:
+        """Read a file that `save` wrote, or one of the first edition in the world frame.
+
+        Args:
+            path: File to read.
+            hand: The hand of the grasps; by default the one that the file names, from robots/.
+
+        Returns:
+            The grasps, on the CPU.
+
+        Raises:
+            FileNotFoundError: The file does not exist.
+            ValueError: The file holds no grasps, is in the camera frame, or is of another hand.
+        """
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"grasp file {path} does not exist")
         try:
             with safe_open(str(path), framework="pt") as file:
-                frame = (file.metadata() or {}).get("frame", "")
+                about = file.metadata() or {}
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118, not a dict
         except SafetensorError as error:
             raise ValueError(
                 f"{path} is not a safetensors file of grasps ({error}); write it with Grasps.save"
             ) from None
-        if "waypoints" not in tensors:
-            raise ValueError(f"{path} holds no tensor named waypoints; write it with Grasps.save")
-        if frame not in ("world", "camera"):
-            raise ValueError(f"{path} names no frame in its metadata; write it with Grasps.save")
-        likelihood = tensors.get("log_likelihood")
         try:
-            return cls(tensors["waypoints"].float(), frame, None if likelihood is None else likelihood.float())
+            trajectory = read_trajectory(tensors)
+            if about.get("frame") != "world":
+                raise ValueError(
+                    f"the grasps are in the {about.get('frame', 'unknown')} frame, expected the world frame; "
+                    "make them again with plan"
+                )
+            likelihood = tensors.get("log_likelihood")
+            likelihood = None if likelihood is None else likelihood.float()
+            return cls.of(trajectory, Hand.of_file(about, hand), likelihood)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
 
-def pose_matrix(
-    position: Float[Tensor, "*batch 3"], quaternion: Float[Tensor, "*batch 4"]
-) -> Float[Tensor, "*batch 4 4"]:
-    """Homogeneous matrices from positions and unit quaternions."""
-    top = torch.cat((rotation.to_matrix(quaternion), position[..., None]), dim=-1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
-    return torch.cat((top, bottom), dim=-2)
+def read_trajectory(tensors: dict[str, Tensor]) -> Trajectory:
+    """Trajectories from the tensors of a file.
 
+    Args:
+        tensors: `wrist`, `joints` and `grasp_type`; or, in files of the first edition, `waypoints` (grasp, 10, 28):
+            position, quaternion, 20 joints, type.
 
-def step_pose(
-    pose: Float[Tensor, "*batch 4 4"], tangent: Float[Tensor, "*batch 6"], box: Float[Tensor, 6] | None = None
-) -> Float[Tensor, "*batch 4 4"]:
-    """Poses moved in the tangent space of SE(3): a translation (m) and a rotation vector (rad), in their own frame.
+    Returns:
+        The trajectories, float32, values unchecked.
 
-    box: half sizes of the box that the step stays in, smoothly: a step of t is box * tanh(t / box).
+    Raises:
+        ValueError: A tensor is missing, or has the wrong shape.
     """
-    step = tangent if box is None else box * torch.tanh(tangent / box)
-    return pose @ pose_matrix(step[..., :3], rotation.exp(step[..., 3:]))
-
-
-def in_frame(pose: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "*cloud point 3"]) -> Tensor:
-    """Points in the frames of poses, which they broadcast against: quicker than to bring a whole hand to the points."""
-    return (points - pose[..., None, :3, 3]) @ pose[..., :3, :3]
-
-
-def transform_waypoints(
-    T_a_b: Float[Tensor, "*pose 4 4"], waypoints: Float[Tensor, "*batch 10 28"]
-) -> Float[Tensor, "*batch 10 28"]:
-    """Waypoints given in frame b, expressed in frame a. T_a_b is one pose, or one for each grasp."""
-    if T_a_b.ndim > 2:
-        T_a_b = T_a_b[..., None, :, :]
-    position = (T_a_b[..., :3, :3] @ waypoints[..., POSITION, None]).squeeze(-1) + T_a_b[..., :3, 3]
-    turn = rotation.from_matrix(T_a_b[..., :3, :3])
-    quaternion = rotation.normalize(rotation.multiply(*torch.broadcast_tensors(turn, waypoints[..., QUATERNION])))
-    return torch.cat((position, quaternion, waypoints[..., 7:]), dim=-1)
+    if "waypoints" in tensors:
+        rows = tensors["waypoints"].float()
+        if rows.ndim != 3 or rows.shape[1:] != (NUM_WAYPOINTS, 28):
+            raise ValueError(f"waypoints have shape {tuple(rows.shape)}, expected (num_grasps, 10, 28)")
+        return Trajectory(rows[..., :7], rows[..., 7:27], rows[:, 0, 27].round().long())
+    for name in ("wrist", "joints", "grasp_type"):
+        if name not in tensors:
+            raise ValueError(f"there is no tensor {name}; write the file with Grasps.save")
+    return Trajectory(tensors["wrist"].float(), tensors["joints"].float(), tensors["grasp_type"].long())

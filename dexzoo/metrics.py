@@ -48,7 +48,16 @@ class SceneMetric(Metric):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
     def update(self, preds: Tensor, target: Tensor, indexes: Tensor) -> None:
-        """Take in scored grasps; all three of shape (num_grasps,)."""
+        """Take in scored grasps.
+
+        Args:
+            preds: Scores of any monotonic scale, (grasp,).
+            target: Successes, 0 or 1, (grasp,).
+            indexes: Integers that name the scene, (grasp,).
+
+        Raises:
+            ValueError: The shapes differ.
+        """
         if not preds.shape == target.shape == indexes.shape:
             raise ValueError(
                 f"{type(self).__name__}: preds {tuple(preds.shape)}, target {tuple(target.shape)} and indexes "
@@ -59,7 +68,7 @@ class SceneMetric(Metric):
         self.indexes.append(indexes.detach().long())
 
     def by_scene(self) -> Tensor:
-        """The figure, or row of figures, of each scene in the order of their indexes; nan where it has none."""
+        """The figure, or row of figures, of each scene in the order of their indexes; nan if it has none."""
         raise NotImplementedError
 
     def compute(self) -> Tensor:
@@ -83,6 +92,12 @@ class TopKSuccess(SceneMetric):
 
     A scene with fewer than k grasps counts with all it has. With k = 1 this is the thesis' "top grasp" figure.
 
+    Args:
+        k: Number of best grasps.
+
+    Raises:
+        ValueError: k is below 1.
+
     >>> metric = TopKSuccess(k=1)
     >>> metric.update(torch.tensor([0.9, 0.2, 0.4, 0.6]), torch.tensor([1, 0, 1, 0]), torch.tensor([0, 0, 7, 7]))
     >>> metric.compute()
@@ -105,8 +120,14 @@ class TopKSuccess(SceneMetric):
 class SuccessByRank(SceneMetric):
     """Success rate of the best tenth of each scene's grasps, of the second, and so on (thesis, Fig. 3.13).
 
-    A scene with fewer grasps than parts has none in some of them, and counts only where it has. `compute` gives
+    A scene with fewer grasps than parts has none in some of them, and counts only in the others. `compute` gives
     (num_parts,), best first.
+
+    Args:
+        num_parts: Number of parts.
+
+    Raises:
+        ValueError: num_parts is below 1.
 
     >>> metric = SuccessByRank(num_parts=2)
     >>> metric.update(torch.tensor([0.9, 0.8, 0.4, 0.1]), torch.tensor([1, 1, 1, 0]), torch.zeros(4))
@@ -134,8 +155,8 @@ class SuccessByRank(SceneMetric):
 class SceneAUROC(SceneMetric):
     """Area under the ROC curve within each scene, averaged over the scenes that have both successes and failures.
 
-    It is the chance that a success ranks above a failure of the same scene, a tie counting half: what a planner needs,
-    which never chooses between scenes. Telling easy scenes from hard ones raises the plain AUROC, but not this.
+    It is the chance that a success ranks above a failure of the same scene, a tie counting half. A planner
+    never chooses between scenes. Telling easy scenes from hard ones raises the plain AUROC, but not this.
 
     >>> metric = SceneAUROC()
     >>> metric.update(torch.tensor([0.9, 0.5, 0.1]), torch.tensor([1, 0, 1]), torch.zeros(3))
@@ -165,6 +186,12 @@ class CalibrationError(Metric):
     probability and its success rate (Guo et al. 2017, equation 3). `bins` gives the reliability diagram. torchmetrics'
     BinaryCalibrationError gives the same number without the diagram, and keeps every grasp; this one keeps sums.
 
+    Args:
+        num_bins: Number of bins.
+
+    Raises:
+        ValueError: num_bins is below 1.
+
     >>> metric = CalibrationError()
     >>> metric.update(torch.tensor([0.7, 0.7, 0.7, 0.7]), torch.tensor([1, 1, 0, 0]))
     >>> metric.compute()
@@ -184,7 +211,15 @@ class CalibrationError(Metric):
         self.add_state("sums", default=torch.zeros(num_bins, 3, dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, preds: Tensor, target: Tensor) -> None:
-        """Take in probabilities and successes 0 or 1, both (num_grasps,)."""
+        """Take in predictions.
+
+        Args:
+            preds: Probabilities, (grasp,).
+            target: Successes, 0 or 1, (grasp,).
+
+        Raises:
+            ValueError: The shapes differ, or a probability is outside 0 to 1.
+        """
         if preds.shape != target.shape:
             raise ValueError(
                 f"CalibrationError: preds {tuple(preds.shape)} and target {tuple(target.shape)} must have one shape"
@@ -197,19 +232,31 @@ class CalibrationError(Metric):
         return expected_calibration_error(self.sums).float()
 
     def bins(self) -> Float[Tensor, "bin 3"]:
-        """Of each bin the number of grasps, their mean probability and success rate, both nan where there are none."""
+        """Of each bin the number of grasps, their mean probability and success rate, both nan if there are none."""
         return torch.cat((self.sums[:, :1], self.sums[:, 1:] / self.sums[:, :1]), 1)
 
 
 def bin_index(probability: Tensor, num_bins: int) -> Int[Tensor, " grasp"]:
-    """Which of num_bins bins of equal width each probability falls into; ValueError for one outside 0 to 1."""
+    """Bin of equal width that each probability falls into.
+
+    Args:
+        probability: Probabilities.
+        num_bins: Number of bins.
+
+    Raises:
+        ValueError: A probability is outside 0 to 1.
+    """
     if not bool(((probability >= 0) & (probability <= 1)).all()):
         raise ValueError("probabilities must lie between 0 and 1; give sigmoid(logit)")
     return (probability * num_bins).long().clamp_max(num_bins - 1)
 
 
 def expected_calibration_error(sums: Float[Tensor, "*batch bin 3"]) -> Float[Tensor, "*batch"]:
-    """The error from each bin's number of grasps and sums of probability and success; nan where all are empty."""
+    """The error from the sums of each bin; nan if all are empty.
+
+    Args:
+        sums: Number of grasps, sum of probability and sum of success of each bin.
+    """
     count, probability, success = sums.unbind(-1)
     return (probability - success).abs().sum(-1) / count.sum(-1)
 

@@ -3,52 +3,69 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from dexzoo.camera import Observation
-from dexzoo.generators import make_generator
-from dexzoo.generators.generator import GraspGenerator
-from dexzoo.generators.kopicki import KopickiGenerator
+from dexzoo.generators import GraspGenerator, make_generator
 from dexzoo.grasp import Grasps
+from dexzoo.hand import Hand
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.zoo import load
-from dexzoo.refinement import Weights, rank, refine
-from dexzoo.refinement.method import check_judge
-from dexzoo.refinement.ranking import best_first, check
+from dexzoo.perception import Observation, View
+from dexzoo.refinement.ranking import best_first, check_ranking, rank
+from dexzoo.refinement.refinement import check_judge, refine
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Grasps in the camera frame, best first, and what is known of each.
+    """Ranked grasps of one observation; tensors are (grasp,).
 
-    given: the same grasps before refinement. All others (num_grasps,). score: probability of success as generated.
-    refined_score: after refinement; equal to score where none was asked for or accepted. generator_rank: place in the
-    generator's own order, 0 the best.
+    Attributes:
+        grasps: Grasps in the world frame of the observation, best first.
+        given: The same grasps before refinement.
+        score: Probability of success as generated.
+        refined_score: Probability of success after refinement; equal to `score` where a grasp was not refined.
+        generator_rank: Place in the generator's own order, 0 the best.
     """
 
     grasps: Grasps
     given: Grasps
-    score: Tensor
-    refined_score: Tensor
-    generator_rank: Tensor
+    score: Float[Tensor, " grasp"]
+    refined_score: Float[Tensor, " grasp"]
+    generator_rank: Int[Tensor, " grasp"]
 
 
 def generate(
-    observation: Observation, num_grasps: int = 100, seed: int = 0, generator: str | GraspGenerator = "kopicki"
+    observation: Observation | View,
+    num_grasps: int = 100,
+    seed: int = 0,
+    generator: str | GraspGenerator = "kopicki",
+    hand: str | Path | Hand = "dlr2",
 ) -> Grasps:
-    """At most `num_grasps` grasps in the camera frame, best first; the same for the same seed.
+    """Propose grasps.
 
-    generator: "kopicki", "heuristic", a folder of demonstrations that Kopicki's learns from, or an object.
-    Raises ValueError when too little of the object is seen, RuntimeError when no feasible grasp is found.
+    Args:
+        observation: The view of the object.
+        num_grasps: Most grasps to propose.
+        seed: The same seed gives the same grasps.
+        generator: "kopicki", "heuristic", a folder of demonstrations that Kopicki's learns from, or a generator.
+        hand: The hand, or its name in robots/; a given generator has its own.
+
+    Returns:
+        Grasps in the world frame of the observation, best first.
+
+    Raises:
+        ValueError: Too little of the object is seen, or the generator is unknown.
+        RuntimeError: No feasible grasp is found.
     """
-    chosen = make_generator(generator) if isinstance(generator, str) else generator
-    return chosen.generate(observation, num_grasps, seed)
+    return _generator(generator, hand).generate(observation, num_grasps, seed)
 
 
 def plan(
-    observation: Observation,
+    observation: Observation | View,
     evaluator: str | GraspEvaluator = "em_fk",
     num_grasps: int = 100,
     num_refined: int = 0,
@@ -56,34 +73,51 @@ def plan(
     generator: str | GraspGenerator = "kopicki",
     judge: str | GraspEvaluator | None = None,
     ranking: str = "before",
+    hand: str | Path | Hand = "dlr2",
 ) -> Plan:
-    """Generate grasps, rank them by the evaluator and refine the best `num_refined`, which stay ahead of the others.
+    """Generate grasps, rank them by an evaluator and refine the best, which stay ahead of the others.
 
-    generator: as in `generate`; Kopicki's is the prior of refinement too, with others there is none.
-    judge: a second evaluator, without whose consent no grasp is replaced. ranking: the order of the refined, a name in
-    `dexzoo.refinement.RANKINGS`; "before" leaves that of the scores as generated: ranking by refined scores picks the
-    grasps whose score inflated most (thesis, Table 4.6).
-    Raises what `generate`, `dexzoo.refine` and `dexzoo.load` raise.
+    Args:
+        observation: The view of the object.
+        evaluator: Predicts success: a model, or its name for `dexzoo.load`.
+        num_grasps: Most grasps to generate.
+        num_refined: How many of the best are refined.
+        seed: The same seed gives the same plan.
+        generator: As in `generate`; its density is the prior of refinement, if it has one.
+        judge: A second evaluator that must agree before a grasp is replaced.
+        ranking: Order of the refined grasps, a name in `dexzoo.refinement.RANKINGS`. "before" keeps that of the scores
+            as generated: ranking by refined scores picks the grasps whose score inflated most (thesis, Table 4.6).
+        hand: As in `generate`.
+
+    Returns:
+        The plan.
+
+    Raises:
+        ValueError: As in `generate` and `dexzoo.refine`, or the ranking is unknown.
+        RuntimeError: No feasible grasp is found.
+        FileNotFoundError: A model cannot be loaded.
     """
     model = load(evaluator) if isinstance(evaluator, str) else evaluator
     second = load(judge) if isinstance(judge, str) else judge
-    check(ranking, second is not None)
+    check_ranking(ranking, second is not None)
     if second is not None:
         check_judge(model, second)
-    chosen = make_generator(generator) if isinstance(generator, str) else generator
-    density, weights = None, Weights(prior=0.0)
-    if isinstance(chosen, KopickiGenerator):
-        density, weights = chosen.density(observation, seed), Weights()
-        generated = chosen.generate(observation, num_grasps, seed, density)
-    else:
-        generated = chosen.generate(observation, num_grasps, seed)
-    score = model.score(observation, generated)
+    view, chosen = View.of(observation), _generator(generator, hand)
+    model.check_hand(chosen.hand)
+    generated = chosen.generate(view, num_grasps, seed)
+    score = model.score(generated, view)
     order = best_first(score)
     if num_refined <= 0:
         return Plan(generated[order], generated[order], score[order], score[order], order)
-    best = generated[order[:num_refined]]
-    result = refine(best, observation, model, judge=second, weights=weights, density=density)
+    prior = chosen.density(view, seed)
+    result = refine(generated[order[:num_refined]], view, model, judge=second, prior=prior)
     place, rest = rank(result, ranking), order[num_refined:]
     order = torch.cat((order[:num_refined][place], rest))
     grasps = Grasps.concatenate([result.grasps[place], generated[rest]])
     return Plan(grasps, generated[order], score[order], torch.cat((result.score_after[place], score[rest])), order)
+
+
+def _generator(generator: str | GraspGenerator, hand: str | Path | Hand) -> GraspGenerator:
+    if isinstance(generator, GraspGenerator):
+        return generator
+    return make_generator(generator, hand if isinstance(hand, Hand) else Hand.load(hand))

@@ -1,4 +1,4 @@
-"""Where the files that travel with the package lie: robots, configs, checkpoints."""
+"""Folders of the files that come with the package: robots, configs, checkpoints."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ _PACKAGE = Path(__file__).parent
 
 
 def resource(name: str) -> Path:
-    """The folder `name`: inside an installed package, or in a source tree beside the package or in its assets."""
+    """A folder of data: inside an installed package, or in a source tree beside the package or in its assets.
+
+    Args:
+        name: robots, configs, checkpoints, or a path such as assets/grasps.
+    """
     inside = _PACKAGE / "resources" / name
     if inside.exists():
         return inside

@@ -11,12 +11,11 @@ from rich.console import Console
 from rich.table import Table
 
 import dexzoo
-from dexzoo import plots
-from dexzoo.camera import look_at
 from dexzoo.grasp import GRASP_TYPES
-from dexzoo.hand import default_hand
+from dexzoo.perception.camera import look_at
 from dexzoo.sim import trial
 from dexzoo.sim.shapes import make_object
+from dexzoo.viewing import pictures
 
 NUM_REFINED = 10
 console = Console()
@@ -51,25 +50,25 @@ def main() -> None:
     console.print(f"Of all {len(plan.grasps)} grasps {int(outcomes.success.sum())} hold.")
 
     best = int(np.flatnonzero(outcomes.success)[0]) if outcomes.success.any() else 0
-    plots.save(plots.grasp_picture(observation, default_hand(), plan.grasps[best]), options.out / "grasp.png")
-    plots.save(
-        lift_picture(scene, plan.grasps[best].to_frame("world", observation.T_world_camera)), options.out / "lift.png"
-    )
+    pictures.save(pictures.grasp_picture(observation, plan.grasps[best]), options.out / "grasp.png")
+    pictures.save(lift_picture(scene, plan.grasps[best]), options.out / "lift.png")
     console.print(f"Pictures of the grasp ranked {best + 1}: {options.out / 'grasp.png'}, {options.out / 'lift.png'}")
 
 
-def lift_picture(scene: dexzoo.sim.Scene, grasp: dexzoo.Grasps) -> plots.Image:
+def lift_picture(scene: dexzoo.sim.Scene, grasp: dexzoo.Grasps) -> pictures.Image:
     """The trial at five moments, seen from the side."""
-    hand = default_hand()
     moments = {"pre-grasp": -1.4, "grip": -0.5, "squeeze": -0.02, "lifted by half": 1.0, "held": 3.9}
     camera = dexzoo.Camera(300, 400, 380, 380, 150, 200)
-    pictures = []
-    for moment in trial.replay(scene, grasp, hand, list(moments.values())):
+    cells = []
+    for moment in trial.replay(scene, grasp, list(moments.values())):
         mesh = scene.object.mesh.copy().apply_transform(moment.T_world_object)
-        solids = [plots.Solid(mesh, plots.OBJECT_COLOUR), plots.hand_solid(hand, moment.waypoint)]
-        target = np.array([0, 0, max(0.12, float(moment.waypoint[2]) - 0.08)])
-        pictures.append(plots.render(solids, camera, look_at(target, 0.75, 0.6, 0.3))[0])
-    return plots.grid(pictures, list(moments), columns=len(moments))
+        solids = [
+            pictures.Solid(mesh, pictures.OBJECT_COLOR),
+            pictures.hand_solid(grasp.hand, moment.wrist, moment.joints),
+        ]
+        target = np.array([0, 0, max(0.12, float(moment.wrist[2]) - 0.08)])
+        cells.append(pictures.render(solids, camera, look_at(target, 0.75, 0.6, 0.3))[0])
+    return pictures.grid(cells, list(moments), columns=len(moments))
 
 
 if __name__ == "__main__":

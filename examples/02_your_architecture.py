@@ -8,14 +8,16 @@ import argparse
 from pathlib import Path
 from typing import Unpack
 
-import torch
-from lightning import Trainer
+from lightning import Trainer, seed_everything
 from torch import Tensor, nn
 
 import dexzoo
+from dexzoo.collection.rendering import render
 from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.grasp import Trajectory
+from dexzoo.models.batch import Encoding
 from dexzoo.models.encoders import GraspVector
-from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
+from dexzoo.models.evaluator import EvaluatorOptions, GraspEvaluator
 
 
 class TwoBranches(GraspEvaluator):
@@ -23,35 +25,35 @@ class TwoBranches(GraspEvaluator):
 
     architecture = "two_branches"  # the name in its card, by which `load` finds the class
 
-    def __init__(self, width: int = 128, **training: Unpack[TrainingOptions]) -> None:
-        super().__init__(**training)
+    def __init__(self, width: int = 128, **options: Unpack[EvaluatorOptions]) -> None:
+        super().__init__(**options)
         self.width = width  # arguments are kept under their names: from them the model is made again
         layers = [nn.Conv2d(2, 16, 5, 4), nn.ReLU(), nn.Conv2d(16, 32, 5, 4), nn.ReLU(), nn.Conv2d(32, 64, 3, 2)]
         self.view = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(64, width))
         self.grasp_vector, self.grasp = GraspVector(), nn.Linear(280, width)
         self.head = nn.Sequential(nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
 
-    def fit_statistics(self, images: Tensor, waypoints: Tensor) -> None:
-        """Standardise the grasp's 280 numbers by the training data."""
-        self.grasp_vector.fit_statistics(waypoints)
+    def fit_statistics(self, images: Tensor, grasps: Trajectory) -> None:
+        """Standardize the grasp's 280 numbers by the training data."""
+        self.grasp_vector.fit_statistics(grasps)
 
-    def encode(self, images: Tensor) -> Scene:
+    def encode(self, images: Tensor) -> Encoding:
         """(view, 2, 224, 224) -> what `logit` needs of each view, computed once."""
         return {"view": self.view(images)}
 
-    def logit(self, scene: Scene, grasps: Tensor) -> Tensor:
-        """(view, grasp, 10, 28) -> (view, grasp) log-odds of success."""
-        return self.head(scene["view"][:, None] + self.grasp(self.grasp_vector(grasps)))[..., 0]
+    def logit(self, encoding: Encoding, grasps: Trajectory) -> Tensor:
+        """Trajectories (view, grasp) -> (view, grasp) log-odds of success."""
+        return self.head(encoding["view"][:, None] + self.grasp(self.grasp_vector(grasps)))[..., 0]
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/yours"))
     options = parser.parse_args()
-    torch.manual_seed(0)
+    seed_everything(0)
     data, made = GraspDataModule(num_scenes=4), TwoBranches(optimizer="adamw", average_decay=0.9)
-    trainer = Trainer(max_steps=50, accelerator="cpu", logger=False, enable_checkpointing=False)
-    trainer.fit(made, datamodule=data)
+    data.renderer = render  # the shipped set keeps no images
+    Trainer(max_steps=50, accelerator="cpu", logger=False, enable_checkpointing=False).fit(made, datamodule=data)
     model = dexzoo.load(made.save(options.out, card={"data": data.describe()}))
-    p = model.score(data.source.observation(0), data.source.world_grasps[:20])
+    p = model.score(data.source.world_grasps[:20], data.source.observation(0))
     print("probabilities of success of the first twenty grasps:", [round(float(x), 2) for x in p])

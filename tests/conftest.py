@@ -16,10 +16,10 @@ hypothesis.settings.register_profile("dexzoo", deadline=None, derandomize=True, 
 hypothesis.settings.load_profile("dexzoo")
 
 # only now, so that the hook reaches them
-from dexzoo.camera import Observation  # noqa: E402
 from dexzoo.generators.heuristic import HeuristicGenerator  # noqa: E402
 from dexzoo.grasp import Grasps  # noqa: E402
-from dexzoo.hand import Hand, default_hand  # noqa: E402
+from dexzoo.hand import Hand  # noqa: E402
+from dexzoo.perception import Observation  # noqa: E402
 from dexzoo.sim import Outcomes, Scene  # noqa: E402
 from dexzoo.sim.shapes import make_object  # noqa: E402
 from dexzoo.verification import verify  # noqa: E402
@@ -38,7 +38,7 @@ def as_users_run_it() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def hand() -> Hand:
-    return default_hand()
+    return Hand.load()
 
 
 @pytest.fixture(scope="session")
@@ -52,9 +52,9 @@ def can_view(can_scene: Scene) -> Observation:
 
 
 @pytest.fixture(scope="session")
-def can_grasps(can_view: Observation) -> Grasps:
-    """Fifty grasps in the frame of the camera, of which about ten hold."""
-    return HeuristicGenerator(num_samples=800).generate(can_view, 50, seed=0)
+def can_grasps(can_view: Observation, hand: Hand) -> Grasps:
+    """Fifty grasps, of which about ten hold."""
+    return HeuristicGenerator(hand, num_samples=800).generate(can_view, 50, seed=0)
 
 
 @pytest.fixture(scope="session")

@@ -84,7 +84,7 @@ def test_runs_go_on_are_not_repeated_and_are_measured_as_compare_does(
     assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
 
     with monkeypatch.context() as patch:
-        patch.setattr(ablation.training, "main", lambda _: pytest.fail("repeated"))
+        patch.setattr(ablation.command_line, "main", lambda _: pytest.fail("repeated"))
         ablation.fit(folder / "em2@50", known["em2@50"], grasps, 4 * 64)
         with pytest.raises(ValueError, match=r"em2@50\.yaml differs from what is asked for"):
             ablation.fit(folder / "em2@50", known["em2@50"], grasps, 5 * 64)

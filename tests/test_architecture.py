@@ -3,34 +3,32 @@
 import ast
 from collections.abc import Iterator
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "dexzoo"
 FILES = sorted(PACKAGE.rglob("*.py"))
-MODULES = sorted({path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in FILES} - {"__init__"})
+ROOMS = sorted({path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in FILES} - {"__init__"})
+"""Folders of the package, and the files beside them."""
 
-# Each module may import those of the lines above its own, and none of its own line or below.
+# Each room may import those of the lines above its own, and none of its own line or below.
 LAYERS = [
-    {"rotation", "resources", "segmentation"},
-    {"grasp", "camera"},
-    {"hand_spec", "sensor"},
-    {"kinematics", "geometry"},
-    {"hand"},
-    {"metrics", "sim", "generators"},
-    {"models"},
-    {"refinement", "verification"},
-    {"data"},
-    {"planning", "training", "comparison", "plots", "viewer"},
-    {"commands"},
+    {"rotation", "resources", "metrics"},
+    {"hand", "perception"},
+    {"grasp"},
+    {"generators", "models", "sim", "viewing"},
+    {"refinement", "verification", "data"},
+    {"planning", "collection", "comparison"},
+    {"training"},
     {"cli"},
     {"__main__"},
 ]
-BELOW = {module: set().union(*LAYERS[:i]) for i, layer in enumerate(LAYERS) for module in layer}
-BELOW["rotation"] = BELOW["resources"] = set()
-# What judges by simulation stays apart from what it judges.
-WITHOUT_SIMULATOR = ["models", "generators", "refinement", "planning"]
+BELOW = {room: set().union(*LAYERS[:i]) for i, layer in enumerate(LAYERS) for room in layer}
+# The simulator judges; these stay apart from the judge.
+WITHOUT_SIMULATOR = ["perception", "hand", "generators", "models", "refinement", "planning", "data"]
+MAX_FILES_AT_TOP = 8
 
 pytestmark = pytest.mark.skipif(not FILES, reason="the package's source is not beside the tests")
 
@@ -44,47 +42,74 @@ def parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+def nodes(tree: ast.AST) -> Iterator[ast.AST]:
+    """All nodes of a file but those that only a type checker reads."""
+    for node in ast.iter_child_nodes(tree):
+        if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
+            yield node
+            yield from nodes(node)
+
+
 def imports(path: Path) -> Iterator[str]:
-    """Full names of all that a file imports, wherever in it."""
-    for node in ast.walk(parse(path)):
+    """Full names of all that a file imports when it runs, wherever in it."""
+    for node in nodes(parse(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{name(path)}:{node.lineno} imports relatively"
-            yield str(node.module)
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def modules_imported_by(module: str) -> set[str]:
-    """Names of our modules and folders that one of them imports, itself left out."""
-    files = [path for path in FILES if path.relative_to(PACKAGE).parts[0].removesuffix(".py") == module]
-    found = {full.split(".")[1] for path in files for full in imports(path) if full.startswith("dexzoo.")}
-    return found - {module}
+def rooms_imported_by(room: str) -> set[str]:
+    """Names of our rooms that one of them imports, itself left out."""
+    files = [path for path in FILES if path.relative_to(PACKAGE).parts[0].removesuffix(".py") == room]
+    ours = (full.split(".") for path in files for full in imports(path))
+    return {parts[1] if parts[1:] else "dexzoo" for parts in ours if parts[0] == "dexzoo"} - {room}
 
 
-def test_each_module_has_a_layer() -> None:
-    assert set(MODULES) <= set(BELOW), "give the new module its line in LAYERS"
+def test_each_room_has_a_layer() -> None:
+    assert set(ROOMS) == set(BELOW), "give the new room its line in LAYERS"
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_imports_run_one_way(module: str) -> None:
-    imported = modules_imported_by(module)
+@pytest.mark.parametrize("room", ROOMS)
+def test_imports_run_one_way(room: str) -> None:
+    imported = rooms_imported_by(room)
     assert imported <= set(BELOW), "import a name from the module that defines it, not from the package"
-    assert imported <= BELOW[module]
+    assert imported <= BELOW[room]
 
 
-@pytest.mark.parametrize("module", [module for module in WITHOUT_SIMULATOR if module in MODULES])
-def test_what_is_judged_never_reaches_the_judge(module: str) -> None:
-    reached, new = set(), {module}
+def test_no_files_import_each_other() -> None:
+    modules = {".".join(("dexzoo", *path.relative_to(PACKAGE).with_suffix("").parts)): path for path in FILES}
+    modules = {module.removesuffix(".__init__"): path for module, path in modules.items()}
+
+    def module_of(full: str) -> str:
+        return full if full in modules else full.rpartition(".")[0]
+
+    graph = {
+        module: {module_of(full) for full in imports(path) if full.startswith("dexzoo.")}
+        for module, path in modules.items()
+    }
+    assert set().union(*graph.values()) <= set(graph)
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+@pytest.mark.parametrize("room", WITHOUT_SIMULATOR)
+def test_what_is_judged_never_reaches_the_judge(room: str) -> None:
+    reached, new = set(), {room}
     while new:
         reached |= new
-        new = set().union(*(modules_imported_by(other) for other in new if other in MODULES)) - reached
+        new = set().union(*map(rooms_imported_by, new)) - reached
     assert "sim" not in reached
 
 
 def test_only_the_simulator_imports_mujoco() -> None:
     users = {name(path) for path in FILES if any(full.split(".")[0] == "mujoco" for full in imports(path))}
+    assert users
     assert all(user.startswith("sim/") for user in users), users
+
+
+def test_few_files_stand_at_the_top() -> None:
+    assert len(list(PACKAGE.glob("*.py"))) <= MAX_FILES_AT_TOP, "give the new file a room"
 
 
 def test_loading_never_unpickles() -> None:

@@ -15,8 +15,10 @@ from scipy.spatial import cKDTree
 
 import dexzoo
 from dexzoo import rotation
-from dexzoo.camera import Camera, Observation, colourise
-from dexzoo.segmentation import fit_table
+from dexzoo.models.encoders import colorize
+from dexzoo.perception.camera import Camera
+from dexzoo.perception.observation import Observation
+from dexzoo.perception.table import fit_table
 
 CAMERA = Camera()
 CENTER, RADIUS = np.array([0.02, -0.01, 0.05]), 0.05  # a ball on the table
@@ -134,16 +136,16 @@ def test_table_of_a_camera_on_its_side() -> None:
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
 
 
-def test_a_pose_is_levelled_by_the_table_that_is_seen() -> None:
+def test_a_pose_is_leveled_by_the_table_that_is_seen() -> None:
     truth = Observation(np.full((480, 640), 0.5), CAMERA, T_WORLD_CAMERA)
     off = T_WORLD_CAMERA.copy()
     tilt = rotation.to_matrix(rotation.exp(torch.tensor([0.02, -0.03, 0.0], dtype=torch.float64))).numpy()
     off[:3, :3] = tilt @ off[:3, :3]
     off[2, 3] += 0.01
-    levelled = Observation(truth.depth, CAMERA, off, truth.table)
-    np.testing.assert_allclose(levelled.T_world_camera[2], truth.table, atol=1e-9)
-    np.testing.assert_allclose(levelled.T_world_camera, T_WORLD_CAMERA, atol=2e-3)
-    np.testing.assert_allclose(levelled.table, truth.table, atol=1e-12)
+    leveled = Observation(truth.depth, CAMERA, off, truth.table)
+    np.testing.assert_allclose(leveled.T_world_camera[2], truth.table, atol=1e-9)
+    np.testing.assert_allclose(leveled.T_world_camera, T_WORLD_CAMERA, atol=2e-3)
+    np.testing.assert_allclose(leveled.table, truth.table, atol=1e-12)
 
 
 @pytest.mark.parametrize(("rise", "tilt", "says"), [(0.1, 0.0, "-100 mm"), (0.0, 0.3, "17.2 degrees")])
@@ -156,7 +158,7 @@ def test_a_pose_that_contradicts_the_table(rise: float, tilt: float, says: str) 
         Observation(np.full((480, 640), 0.5), CAMERA, pose, T_WORLD_CAMERA[2])
 
 
-def test_table_plane_need_not_be_normalised() -> None:
+def test_table_plane_need_not_be_normalized() -> None:
     depth = render(T_WORLD_CAMERA)[0]
     plane = Observation(depth, CAMERA, T_WORLD_CAMERA).table
     np.testing.assert_allclose(Observation(depth, CAMERA, table=3 * plane).table, plane, atol=1e-9)
@@ -232,7 +234,7 @@ def test_aimed_view_turns_the_camera_and_keeps_the_points(T: np.ndarray) -> None
     pixel = whole.points[:, 2].max() / min(CAMERA.fx, aimed.camera.fx)
     assert cKDTree(whole.points_world).query(aimed.points_world)[0].max() < pixel
     assert cKDTree(aimed.points_world).query(whole.points_world)[0].max() < 2 * pixel
-    # the centre of the points is in the middle of the image
+    # the center of the points is in the middle of the image
     center = np.append(whole.points_world.mean(0, dtype=np.float64), 1)
     middle = aimed.camera.project((np.linalg.inv(aimed.T_world_camera) @ center)[:3])
     np.testing.assert_allclose(middle, [111.5, 111.5], atol=1e-2)
@@ -255,30 +257,20 @@ def test_image_is_the_objects_depth_and_height(ball: Observation) -> None:
     np.testing.assert_array_equal(image[0][aimed.mask], aimed.depth[aimed.mask])
 
 
-def test_the_table_can_be_kept_in_the_image(ball: Observation) -> None:
-    aimed = ball.aimed()
-    image, whole = aimed.image(), aimed.image(keep_table=True)
-    np.testing.assert_array_equal(whole[0], aimed.depth)
-    np.testing.assert_array_equal(whole[:, aimed.mask], image[:, aimed.mask])
-    off = (aimed.depth > 0) & ~aimed.mask
-    assert off.sum() > aimed.mask.sum()
-    assert whole[1][off].abs().max() < 0.0081, "all else is table"
+# --- color ----------------------------------------------------------------------------------------------------------
 
 
-# --- colour ----------------------------------------------------------------------------------------------------------
-
-
-def test_colourise_of_a_quadratic_surface() -> None:
+def test_colorize_of_a_quadratic_surface() -> None:
     y, x = torch.meshgrid(torch.arange(12.0).double(), torch.arange(10.0).double(), indexing="ij")
     a, b, c = 0.02, -0.05, 0.03
-    image = colourise((a * x**2 + b * y**2 + c * x * y + 50)[None])
+    image = colorize((a * x**2 + b * y**2 + c * x * y + 50)[None])
     inner = image[0, :, 1:-1, 1:-1]
     mean, gaussian = 2 * a + 2 * b, 4 * a * b - c**2
     torch.testing.assert_close(inner[1], torch.full_like(inner[1], -(abs(mean) ** 0.5)))
     torch.testing.assert_close(inner[2], torch.full_like(inner[2], -(abs(gaussian) ** 0.25)))
 
 
-def test_colourise_agrees_with_scipy() -> None:
+def test_colorize_agrees_with_scipy() -> None:
     rng = np.random.default_rng(0)
     depth = ndimage.gaussian_filter(rng.random((20, 24)), 2) + 0.5
     second = [1.0, -2, 1]
@@ -286,14 +278,14 @@ def test_colourise_agrees_with_scipy() -> None:
     g_xy = ndimage.correlate1d(ndimage.correlate1d(depth, [-0.5, 0, 0.5], 0), [-0.5, 0, 0.5], 1)
     mean, gaussian = g_xx + g_yy, g_xx * g_yy - g_xy**2
     expected = np.stack((depth, np.sign(mean) * abs(mean) ** 0.5, np.sign(gaussian) * abs(gaussian) ** 0.25))
-    ours = colourise(torch.tensor(depth)[None])[0].numpy()
+    ours = colorize(torch.tensor(depth)[None])[0].numpy()
     np.testing.assert_allclose(ours[:, 1:-1, 1:-1], expected[:, 1:-1, 1:-1], atol=1e-6)
 
 
 def test_curvature_is_zero_where_the_window_leaves_the_object() -> None:
     depth = 0.5 + torch.rand(1, 9, 9, generator=torch.Generator().manual_seed(0))
     depth[0, 4, 4] = 0
-    curvature = colourise(depth)[0, 1:] != 0
+    curvature = colorize(depth)[0, 1:] != 0
     assert not curvature[:, 3:6, 3:6].any()
     assert not curvature[:, [0, -1]].any()
     assert not curvature[:, :, [0, -1]].any()
@@ -305,7 +297,7 @@ def test_curvature_is_zero_where_the_window_leaves_the_object() -> None:
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
-    """A good pair of files, in millimetres, for a test to spoil."""
+    """A good pair of files, in millimeters, for a test to spoil."""
     depth, camera = tmp_path / "depth.png", tmp_path / "camera.json"
     cv2.imwrite(str(depth), np.round(render(T_WORLD_CAMERA)[0] * 1000).astype(np.uint16))
     camera.write_text(json.dumps(asdict(CAMERA) | {"depth_scale": 0.001}))
@@ -363,10 +355,10 @@ def test_depth_of_the_wrong_shape(files: tuple[Path, Path]) -> None:
     refused(files, "3 dimensions, expected one channel")
 
 
-def test_depth_in_millimetres(files: tuple[Path, Path]) -> None:
+def test_depth_in_millimeters(files: tuple[Path, Path]) -> None:
     spoil(files[1], depth_scale=1)
-    refused(files, r"median of \d+ and looks like millimetres; give metres")
-    with pytest.raises(ValueError, match="looks like millimetres"):
+    refused(files, r"median of \d+ and looks like millimeters; give meters")
+    with pytest.raises(ValueError, match="looks like millimeters"):
         Observation(render(T_WORLD_CAMERA)[0] * 1000, CAMERA)
 
 
@@ -421,8 +413,8 @@ CAMERA_FILES = [
     ({"fx": -574.0}, r"fx is -574\.0, expected a positive number"),
     ({"cy": None}, "cy is None, expected a number"),
     ({"depth_scale": "drop"}, r"camera\.json has no depth_scale .* which .*depth\.png needs"),
-    ({"depth_scale": "mm"}, "depth_scale is 'mm', expected metres per unit"),
-    ({"depth_scale": 0}, "depth_scale is 0, expected metres per unit"),
+    ({"depth_scale": "mm"}, "depth_scale is 'mm', expected meters per unit"),
+    ({"depth_scale": 0}, "depth_scale is 0, expected meters per unit"),
     ({"table_plane": {"normal": [0, -1, 0]}}, r"camera\.json: table_plane must be"),
     ({"table_plane": [0, -1, 0, 0.5]}, "table_plane must be"),
     ({"table_plane": {"normal": [0, 0, 0], "offset": 0.5}}, r"table plane is \[0.*expected four numbers"),
@@ -487,6 +479,7 @@ def test_grasps_on_real_frames_are_refined(name: str) -> None:
     observation = Observation.load(Path(str(FRAMES)) / f"{name}_depth.png", Path(str(FRAMES)) / f"{name}.json")
     given = dexzoo.generate(observation, num_grasps=4, seed=0)
     result = dexzoo.refine(given, observation, num_steps=4)
-    assert torch.isfinite(result.grasps.waypoints).all()
+    assert torch.isfinite(result.grasps.wrist).all()
+    assert torch.isfinite(result.grasps.joints).all()
     assert result.accepted.any()
     assert result.score_after.mean() > result.score_before.mean()

@@ -1,7 +1,11 @@
 """The command line, called in-process: results for people and machines, and one line for each wrong call."""
 
+import importlib
+import inspect
 import json
+import os
 import runpy
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,18 +17,27 @@ import pytest
 import synthetic
 import torch
 import trimesh
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from dexzoo import cli, commands, planning
-from dexzoo.camera import Observation
+from dexzoo import planning, verification
+from dexzoo.cli import arguments
+from dexzoo.cli import collect as collect_command
+from dexzoo.cli import refine as refine_command
+from dexzoo.cli.main import COMMANDS, TRAINING, main
+from dexzoo.collection import collect as collecting
 from dexzoo.comparison import scores
-from dexzoo.data import collect as collecting
-from dexzoo.generators.heuristic import HeuristicGenerator
-from dexzoo.grasp import GRASP_TYPES, Grasps
+from dexzoo.data import schema
+from dexzoo.generators import GENERATORS, HeuristicGenerator
+from dexzoo.grasp import GRASP_TYPES, GRIP, Grasps, Trajectory
+from dexzoo.hand import Hand
+from dexzoo.models import registry
+from dexzoo.models.batch import Encoding
 from dexzoo.models.em2 import EM2
-from dexzoo.models.evaluator import Scene
-from dexzoo.models.zoo import how_to_get, list_models
+from dexzoo.perception import Observation
+from dexzoo.refinement import OPTIMIZERS, refinement
+from dexzoo.sim import Scene
+from dexzoo.training import command_line
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -34,7 +47,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run a command; gives the exit status, what it wrote and its errors."""
 
     def call(*args: object) -> tuple[int, str, str]:
-        status = cli.main([str(arg) for arg in args])
+        status = main([str(arg) for arg in args])
         return status, *capsys.readouterr()
 
     return call
@@ -42,19 +55,19 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 @pytest.fixture(autouse=True)
 def fewer_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planning, "make_generator", lambda name: HeuristicGenerator(500))
+    monkeypatch.setattr(planning, "make_generator", lambda name, hand: HeuristicGenerator(hand, 500))
 
 
 @pytest.fixture(scope="session")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An EM2 that has learnt nothing yet."""
+    """An EM2 that has learned nothing yet."""
     torch.manual_seed(0)
     return EM2(width=16).save(tmp_path_factory.mktemp("weights"))
 
 
 @pytest.fixture(scope="session")
 def frame(can_view: Observation, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with depth.npy in metres, depth.png in tenths of a millimetre, and a camera file for each."""
+    """A folder with depth.npy in meters, depth.png in tenths of a millimeter, and a camera file for each."""
     folder = tmp_path_factory.mktemp("frame")
     np.save(folder / "depth.npy", can_view.depth)
     cv2.imwrite(str(folder / "depth.png"), (can_view.depth / 1e-4).round().astype(np.uint16))
@@ -73,18 +86,17 @@ def observed(frame: Path, weights: Path) -> list[object]:
 
 
 @pytest.fixture(scope="session")
-def some_grasps(can_grasps: Grasps, can_view: Observation, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with six grasps of the can in either frame."""
-    folder = tmp_path_factory.mktemp("grasps")
-    can_grasps[:6].save(folder / "camera.safetensors")
-    can_grasps[:6].to_frame("world", can_view.T_world_camera).save(folder / "world.safetensors")
-    return folder
+def some_grasps(can_grasps: Grasps, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with six grasps of the can."""
+    path = tmp_path_factory.mktemp("grasps") / "grasps.safetensors"
+    can_grasps[:6].save(path)
+    return path
 
 
 # plan
 
 
-def test_plan_ranks_grasps(run: Run, observed: list[object]) -> None:
+def test_plan_ranks_grasps(run: Run, observed: list[object], can_scene: Scene) -> None:
     status, out, err = run("plan", *observed, "--num_grasps", 12, "--json")
     assert (status, err) == (0, "")
     rows = json.loads(out)["grasps"]
@@ -96,10 +108,14 @@ def test_plan_ranks_grasps(run: Run, observed: list[object]) -> None:
     assert sorted(row["generator_rank"] for row in rows) == list(range(1, len(rows) + 1))
     assert {row["type"] for row in rows} <= set(GRASP_TYPES)
     assert all(row["refined"] == row["score"] for row in rows)
-    assert all(0.1 < np.linalg.norm(row["palm"]) < 1.2 for row in rows)
+    palms = np.array([row["palm"] for row in rows])
+    assert (palms[:, 2] > 0).all(), "above the table"
+    assert (np.linalg.norm(palms - can_scene.T_world_object[:3, 3], axis=1) < 0.35).all(), "at the object"
 
 
-def test_plan_writes_a_folder(run: Run, frame: Path, weights: Path, tmp_path: Path) -> None:
+def test_plan_writes_a_folder(
+    run: Run, frame: Path, weights: Path, tmp_path: Path, can_view: Observation, hand: Hand
+) -> None:
     out = tmp_path / "new" / "plan"
     observation = ["--depth", frame / "depth.png", "--camera", frame / "scaled.json", "--evaluator", weights]
     status, text, err = run("plan", *observation, "--num_grasps", 8, "--refine", "--out", out)
@@ -109,11 +125,34 @@ def test_plan_writes_a_folder(run: Run, frame: Path, weights: Path, tmp_path: Pa
     assert sorted(path.name for path in out.iterdir()) == written
     plan = json.loads((out / "plan.json").read_text())
     grasps = Grasps.load(out / "grasps.safetensors")
-    assert grasps.frame == plan["frame"] == "camera"
+    assert plan["frame"] == "world"
+    np.testing.assert_array_equal(plan["T_world_camera"], can_view.T_world_camera)
+    assert grasps.hand == hand
     assert len(grasps) == len(plan["grasps"])
-    np.testing.assert_allclose(grasps.position[:, 6], [row["palm"] for row in plan["grasps"]], atol=1e-4)
+    np.testing.assert_allclose(grasps.position[:, GRIP], [row["palm"] for row in plan["grasps"]], atol=1e-4)
     picture = cv2.imread(str(out / "best_grasp.png"))
     assert picture.shape[1] > 2 * picture.shape[0]
+
+
+def test_a_plan_is_refined_and_verified_as_it_is(
+    run: Run, observed: list[object], can_scene: Scene, tmp_path: Path
+) -> None:
+    """The three commands agree on the frame: what plan writes holds in the scene that was observed."""
+    assert run("plan", *observed, "--num_grasps", 30, "--out", tmp_path / "plan")[0] == 0
+    grasps = ["--grasps", tmp_path / "plan" / "grasps.safetensors"]
+    refined = tmp_path / "refined.safetensors"
+    status, out, err = run("refine", *observed, *grasps, "--num_steps", 2, "--out", refined, "--json")
+    assert (status, err) == (0, "")
+    planned = json.loads((tmp_path / "plan" / "plan.json").read_text())["grasps"]
+    assert json.loads(out)["score_before"] == pytest.approx([row["score"] for row in planned], abs=2e-4)
+    for path in (grasps[1], refined):
+        status, out, err = run("verify", "--object", can_scene.object.name, "--grasps", path, "--json")
+        assert (status, err) == (0, "")
+        rows = json.loads(out)["grasps"]
+        assert [row["type"] for row in rows] == [row["type"] for row in planned]
+        held = verification.verify(Grasps.load(path), can_scene).success
+        assert [row["success"] for row in rows] == held.tolist()
+        assert held.any()
 
 
 def test_plan_repeats_itself(run: Run, observed: list[object]) -> None:
@@ -125,7 +164,7 @@ def test_plan_repeats_itself(run: Run, observed: list[object]) -> None:
 def test_no_feasible_grasp_is_a_failure_of_the_work(
     run: Run, observed: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(planning, "make_generator", lambda name: HeuristicGenerator(1))
+    monkeypatch.setattr(planning, "make_generator", lambda name, hand: HeuristicGenerator(hand, 1))
     status, out, err = run("plan", *observed, "--out", tmp_path / "out")
     assert (status, out) == (1, "")
     assert err == "dexzoo: no feasible grasp is found: the object may be too large, too flat or out of reach\n"
@@ -136,7 +175,7 @@ def test_no_feasible_grasp_is_a_failure_of_the_work(
 
 
 def test_refine_improves_a_file_of_grasps(run: Run, observed: list[object], some_grasps: Path, tmp_path: Path) -> None:
-    args = ["--grasps", some_grasps / "camera.safetensors", "--num_steps", 3, "--out", tmp_path / "new" / "better"]
+    args = ["--grasps", some_grasps, "--num_steps", 3, "--out", tmp_path / "new" / "better"]
     status, out, err = run("refine", *observed, *args, "--json")
     assert (status, err) == (0, "")
     result = json.loads(out)
@@ -151,12 +190,16 @@ def test_refine_improves_a_file_of_grasps(run: Run, observed: list[object], some
 def test_refine_asks_a_judge_and_draws_what_it_did(
     run: Run, observed: list[object], some_grasps: Path, tmp_path: Path
 ) -> None:
-    args = ["--grasps", some_grasps / "world.safetensors", "--optimiser", "random", "--num_steps", 4, "--seed", 3]
+    args = ["--grasps", some_grasps, "--optimizer", "random", "--num_steps", 4, "--seed", 3]
     picture = tmp_path / "new" / "before and after.png"
-    judge = ["--judge", EM2(width=16).save(tmp_path / "judge"), "--margin", 100]
+    indifferent = EM2(width=16)
+    with torch.no_grad():
+        for parameter in indifferent.parameters():
+            parameter.zero_()
+    judge = ["--judge", indifferent.save(tmp_path / "judge")]
     status, out, err = run("refine", *observed, *args, *judge, "--picture", picture, "--json")
     assert (status, err) == (0, "")
-    assert json.loads(out)["accepted"] == []  # no rise is that great
+    assert json.loads(out)["accepted"] == []  # it finds no grasp better
     assert cv2.imread(str(picture)).shape[1] > 2 * 460
     first, again = (run("refine", *observed, *args, "--json") for _ in range(2))
     assert first == again
@@ -164,6 +207,18 @@ def test_refine_asks_a_judge_and_draws_what_it_did(
     refused(
         run("refine", *observed, *args, "--judge", observed[-1]), "the judge is, or shares a member with, what guides"
     )
+
+
+def test_refine_does_without_a_prior_if_asked(
+    run: Run, observed: list[object], some_grasps: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_generator(name: str, hand: Hand) -> None:
+        raise RuntimeError(f"the prior is that of {name}")
+
+    monkeypatch.setattr(refinement, "make_generator", no_generator)
+    args = ["--grasps", some_grasps, "--num_steps", 0]
+    assert run("refine", *observed, *args, "--prior", "none")[0] == 0
+    assert run("refine", *observed, *args) == (1, "", "dexzoo: the prior is that of kopicki\n")
 
 
 def test_scores_that_are_none_are_null_in_json(
@@ -174,12 +229,12 @@ def test_scores_that_are_none_are_null_in_json(
 
     everywhere, whole = False, EM2.logit
 
-    def broken(model: EM2, scene: Scene, grasps: Tensor) -> Tensor:
-        logit = whole(model, scene, grasps)
+    def broken(model: EM2, encoding: Encoding, grasps: Trajectory) -> Tensor:
+        logit = whole(model, encoding, grasps)
         return logit + torch.nan if everywhere else logit + torch.where(logit == logit[:, :1], torch.nan, 0.0)
 
     monkeypatch.setattr(EM2, "logit", broken)
-    args = ["--grasps", some_grasps / "camera.safetensors", "--num_steps", 0, "--json"]
+    args = ["--grasps", some_grasps, "--num_steps", 0, "--json"]
     result = valid(run("refine", *observed, *args)[1])
     assert result["score_before"][0] is None
     assert result["mean_score_before"] == pytest.approx(np.mean(result["score_before"][1:]), abs=1e-4)
@@ -208,7 +263,7 @@ def test_verify_generates_and_tries(run: Run, weights: Path) -> None:
 def test_verify_tries_a_file_of_grasps_on_a_mesh(run: Run, some_grasps: Path, tmp_path: Path) -> None:
     mesh = tmp_path / "tin.stl"
     trimesh.creation.cylinder(0.035, 0.1, sections=24).export(mesh)
-    args = ["--object", mesh, "--hulls", mesh, "--mass", 0.1, "--grasps", some_grasps / "world.safetensors"]
+    args = ["--object", mesh, "--hulls", mesh, "--mass", 0.1, "--grasps", some_grasps]
     status, out, err = run("verify", *args, "--trials", 2)
     assert (status, err) == (0, "")
     assert "verification of tin" in out
@@ -216,7 +271,7 @@ def test_verify_tries_a_file_of_grasps_on_a_mesh(run: Run, some_grasps: Path, tm
 
 
 def test_collect_makes_a_set_and_goes_on(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collecting, "make_generator", lambda name: HeuristicGenerator(300))
+    monkeypatch.setattr(collecting, "make_generator", lambda name, hand: HeuristicGenerator(hand, 300))
     monkeypatch.setattr(collecting, "object_of", lambda number, split: "can_02")
     monkeypatch.setattr(collecting, "in_processes", lambda function, numbers, workers: map(function, numbers))
     args = ["collect", "--out", tmp_path, "--num_grasps", 10, "--num_views", 1]
@@ -236,15 +291,15 @@ def test_models_are_listed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     status, out, err = run("models", "--json")
     assert (status, err) == (0, "")
     rows = json.loads(out)["models"]
-    assert [row["name"] for row in rows] == list_models()
+    assert [row["name"] for row in rows] == registry.list_models()
     assert all(row["shipped"] for row in rows)
     status, out, err = run("models")
     assert (status, err) == (0, "")
-    assert all(name in out for name in list_models())
-    monkeypatch.setattr(commands, "shipped_card", lambda name: None)
+    assert all(name in out for name in registry.list_models())
+    monkeypatch.setattr(registry, "shipped_weights", lambda name: Path("none.safetensors"))
     status, out, err = run("models")
     assert (status, err) == (0, "")
-    assert how_to_get("em3") in " ".join(out.split())
+    assert registry.how_to_get("em3") in " ".join(out.split())
 
 
 # help
@@ -254,16 +309,76 @@ def test_models_are_listed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_help_lists_all_commands(run: Run, args: list[str]) -> None:
     status, out, err = run(*args)
     assert (status, err) == (0, "")
-    for command in (*cli.TRAINING, "plan", "refine", "verify", "collect", "models"):
+    for command in (*TRAINING, *COMMANDS):
         assert command in out
 
 
-@pytest.mark.parametrize("command", ["plan", "refine", "verify", "collect", "models", "fit"])
+@pytest.mark.parametrize("command", [*COMMANDS, "fit"])
 def test_each_command_has_help(run: Run, command: str) -> None:
     status, out, err = run(command, "--help")
     assert (status, err) == (0, "")
     assert "--seed" in out
     assert "--json" in out
+
+
+def test_help_tells_defaults(run: Run) -> None:
+    words = " ".join(run("refine", "--help")[1].split())
+    for default in ("em_fk", "kopicki", "adam", "30", "0"):
+        assert f"(default: {default})" in words
+    assert "(default: None)" not in words
+    assert "(default: False)" not in words
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_options_are_the_keywords_of_a_commands_function(
+    run: Run, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsers: list[arguments.Parser] = []
+    whole = arguments.Parser.parse_args
+
+    def remembered(parser: arguments.Parser, args: list[str]) -> object:
+        parsers.append(parser)
+        return whole(parser, args)
+
+    monkeypatch.setattr(arguments.Parser, "parse_args", remembered)
+    assert run(command, "--help")[0] == 0
+    options = {action.dest for action in parsers[0]._actions} - {"help"}
+    keywords = set(inspect.signature(importlib.import_module(f"dexzoo.cli.{command}").run).parameters)
+    assert options == keywords | {"json"}
+
+
+def test_choices_are_those_of_the_package() -> None:
+    """They are written out again in the command line, so that help comes without torch."""
+    assert arguments.SPLITS == schema.SPLITS
+    assert collect_command.GENERATORS == GENERATORS
+    assert tuple(OPTIMIZERS) == refine_command.OPTIMIZERS
+    assert refine_command.NUM_STEPS == refinement.NUM_STEPS
+    assert TRAINING == command_line.SUBCOMMANDS
+
+
+# seconds to load, so only what needs them does
+HEAVY = {"torch", "mujoco", "lightning"}
+
+
+def loaded_by(*args: str) -> set[str]:
+    """Heavy packages that a run of Python loads."""
+    show = "import atexit, sys; atexit.register(lambda: print(*sys.modules, file=sys.stderr))"
+    code = f"{show}; sys.argv = ['dexzoo', *{args[1:]}]; {args[0]}"
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    modules = set(done.stderr.split())
+    assert "dexzoo" in modules, done.stderr
+    return HEAVY & modules
+
+
+@pytest.mark.parametrize("args", [["--help"], ["models"], ["plan", "--help"], ["pln"], ["plan", "--speed", "3"]])
+def test_help_and_errors_come_at_once(args: list[str]) -> None:
+    assert loaded_by("import runpy; runpy.run_module('dexzoo', run_name='__main__')", *args) == set()
+
+
+def test_the_package_itself_loads_nothing_heavy() -> None:
+    assert loaded_by("import dexzoo") == set()
+    assert "torch" in loaded_by("import dexzoo; dexzoo.Grasps")
 
 
 def test_the_package_is_a_program(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -290,36 +405,41 @@ def refused(result: tuple[int, str, str], message: str) -> None:
     ("args", "message"),
     [
         (["verfy"], "command 'verfy' is unknown, did you mean verify? use one of fit, validate, test, predict, plan"),
-        (["--json", "models"], "unrecognized arguments: --json; see python -m dexzoo COMMAND --help"),
+        (["--json", "models"], "command '--json' is unknown; use one of fit, validate, test, predict, plan"),
         (["plan"], "required: --depth, --camera; see python -m dexzoo plan --help"),
         (["plan", "--depth"], "--depth: expected one argument"),
         (["plan", "--depth", "d", "--camera", "c", "--speed", "3"], "unrecognized arguments: --speed 3"),
-        (["plan", "--depth", "d", "--camera", "c", "--num_grasps", "0"], "--num_grasps: Not of type PositiveInt"),
-        (["plan", "--depth", "d", "--camera", "c", "--seed", "-1"], "--seed: Not of type NonNegativeInt"),
+        (
+            ["plan", "--depth", "d", "--camera", "c", "--num_grasps", "0"],
+            "--num_grasps: expected a whole number, 1 or more, got '0'",
+        ),
+        (
+            ["plan", "--depth", "d", "--camera", "c", "--seed", "-1"],
+            "--seed: expected a whole number, 0 or more, got '-1'",
+        ),
         (["refine", "--depth", "d", "--camera", "c"], "required: --grasps"),
         (
-            ["refine", "--depth", "d", "--camera", "c", "--grasps", "g", "--optimiser", "sgd"],
-            "--optimiser: invalid choice: 'sgd'",
+            ["refine", "--depth", "d", "--camera", "c", "--grasps", "g", "--optimizer", "sgd"],
+            "--optimizer: invalid choice: 'sgd'",
         ),
         (["verify"], "required: --object"),
-        (["verify", "--object", "can_02", "--trials", "two"], "--trials: Not of type PositiveInt"),
+        (
+            ["verify", "--object", "can_02", "--trials", "two"],
+            "--trials: expected a whole number, 1 or more, got 'two'",
+        ),
         (["verify", "--object", "can_99"], "object 'can_99' is unknown; known are bottle_00...24"),
         (["verify", "--object", "none.obj"], "mesh none.obj does not exist"),
         (["verify", "--object", "can_02", "--mass", "-1"], "object can_02 has a mass of -1.0 kg; give a positive one"),
         (["verify", "--object", "can_02", "--friction", "3"], "has a friction of 3.0; give one in (0, 2]"),
         (["collect"], "required: --out"),
-        (
-            ["collect", "--out", "o", "--refine", "em_fk", "--images"],
-            "--images does nothing with --refine; leave it out",
-        ),
-        (["collect", "--out", "o", "--refine", "em_fk", "--scenes", "3"], "--scenes does nothing with --refine"),
-        (["collect", "--out", "o", "--round", "2"], "--round does nothing without --refine; add that, or leave it out"),
-        (["plan", "--depth", "d", "--camera", "c", "--judge", "em2"], "--judge does nothing without --refine"),
-        (["plan", "--depth", "d", "--camera", "c", "--ranking", "after"], "--ranking does nothing without --refine"),
-        (
-            ["refine", "--depth", "d", "--camera", "c", "--grasps", "g", "--margin", "1"],
-            "--margin does nothing without --judge",
-        ),
+        (["collect", "--out", "o", "--split", "val"], "--split: invalid choice: 'val' (choose from 'train'"),
+        (["collect", "--out", "o", "--generator", "magic"], "--generator: invalid choice: 'magic'"),
+        (["collect", "--out", "o", "--round", "2"], "unrecognized arguments: --round 2"),
+        (["collect_refined"], "required: --out"),
+        (["collect_refined", "--out", "o", "--images"], "unrecognized arguments: --images"),
+        (["collect_refined", "--out", "o", "--round", "0"], "--round: expected a whole number, 1 or more, got '0'"),
+        (["plan", "--depth", "d", "--camera", "c", "--refin"], "unrecognized arguments: --refin; see"),
+        (["view", "--side", "both"], "--side: invalid choice: 'both'"),
         (["fit"], "fit needs a configuration that says what the model is; add --config em2.yaml"),
         (["fit", "--config", "em9.yaml"], "configuration em9.yaml does not exist"),
     ],
@@ -342,12 +462,12 @@ def change_camera(folder: Path, frame: Path, **values: object) -> None:
 
 BAD_DEPTHS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "of another size": (lambda depth: depth[:-1], "depth is 640 x 479 pixels, but the camera is 640 x 480"),
-    "in millimetres": (lambda depth: depth * 1000, "looks like millimetres; give metres"),
+    "in millimeters": (lambda depth: depth * 1000, "looks like millimeters; give meters"),
     "zero": (lambda depth: depth * 0, "depth holds no reading: every pixel is zero, negative, NaN or infinite"),
     "NaN": (lambda depth: depth * np.nan, "depth holds no reading"),
     "infinite": (lambda depth: depth + np.inf, "depth holds no reading"),
     "three-dimensional": (lambda depth: np.stack([depth] * 3), "has 3 dimensions, expected one channel of depth"),
-    "in integers": (lambda depth: (depth * 1000).astype(np.uint16), "has no depth_scale (metres per unit"),
+    "in integers": (lambda depth: (depth * 1000).astype(np.uint16), "has no depth_scale (meters per unit"),
 }
 
 
@@ -392,15 +512,15 @@ def test_files_that_are_missing_or_unreadable_get_one_line(
 ) -> None:
     text = tmp_path / "text"
     text.write_text("neither picture, nor JSON, nor tensors")
-    depth, camera, grasps = frame / "depth.npy", frame / "camera.json", some_grasps / "camera.safetensors"
+    depth, camera, grasps = frame / "depth.npy", frame / "camera.json", some_grasps
     cases = [
         (tmp_path / "none.npy", camera, grasps, "none.npy does not exist"),
-        (text, camera, grasps, "text cannot be read; give a 16-bit PNG or a .npy file in metres"),
+        (text, camera, grasps, "text cannot be read; give a 16-bit PNG or a .npy file in meters"),
         (depth, tmp_path / "none.json", grasps, "camera file"),
         (depth, text, grasps, "text is not JSON"),
         (depth, camera, tmp_path / "none", "none does not exist"),
         (depth, camera, text, "text is not a safetensors file of grasps"),
-        (depth, camera, weights, "holds no tensor named waypoints; write it with Grasps.save"),
+        (depth, camera, weights, "there is no tensor wrist; write the file with Grasps.save"),
         (tmp_path, camera, grasps, "does not exist"),
     ]
     for d, c, g, message in cases:
@@ -426,48 +546,75 @@ def test_models_that_are_not_to_be_had_get_one_line(
     assert not (tmp_path / "out").exists()
 
 
+CHANGES: dict[str, tuple[str, Callable[[Tensor], Tensor], str]] = {
+    "shape": ("wrist", lambda w: w[:, :5], "wrist of grasps has shape (6, 5, 7), expected (num_grasps, 10, 7)"),
+    "number of joints": ("joints", lambda q: q[..., :16], "(6, 10, 16), expected (6, 10, 20)"),
+    "quaternion": (
+        "wrist",
+        lambda w: torch.cat((w[..., :3], 2 * w[..., 3:]), -1),
+        "has length 2.000, expected 1 (wxyz",
+    ),
+    "joints": ("joints", lambda q: q + 2, "outside its limits"),
+    "type": ("grasp_type", lambda kind: kind + 20, "expected 0 to 9"),
+    "nan": ("wrist", lambda w: w * torch.nan, "wrist of grasp 0 holds a number that is not finite"),
+}
+
+
 @pytest.mark.usefixtures("as_users_run_it")
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda w: w[:, :5], "grasps have shape (6, 5, 28), expected (num_grasps, 10, 28)"),
-        (lambda w: torch.cat((w[..., :3], 2 * w[..., 3:7], w[..., 7:]), -1), "has length 2.000, expected 1 (wxyz"),
-        (lambda w: torch.cat((w[..., :7], w[..., 7:27] + 2, w[..., 27:]), -1), "outside its limits"),
-        (lambda w: torch.cat((w[..., :27], w[..., 27:] + 20), -1), "expected 0 to 9 (number 27)"),
-        (lambda w: w * torch.nan, "grasp 0 holds a number that is not finite"),
-    ],
-    ids=["shape", "quaternion", "joints", "type", "nan"],
-)
+@pytest.mark.parametrize("kind", CHANGES)
 def test_bad_grasps_get_one_line(
-    run: Run,
-    observed: list[object],
-    some_grasps: Path,
-    tmp_path: Path,
-    change: Callable[[torch.Tensor], torch.Tensor],
-    message: str,
+    run: Run, observed: list[object], some_grasps: Path, tmp_path: Path, kind: str
 ) -> None:
-    good = Grasps.load(some_grasps / "world.safetensors")
+    name, change, message = CHANGES[kind]
+    tensors = load_file(some_grasps)
+    tensors[name] = change(tensors[name]).contiguous()
     path = tmp_path / "grasps.safetensors"
-    save_file({"waypoints": change(good.waypoints).contiguous()}, path, metadata={"frame": "world"})
+    save_file(tensors, path, metadata={"frame": "world"})
     refused(run("verify", "--object", "can_02", "--grasps", path), message)
     refused(run("refine", *observed, "--grasps", path, "--out", tmp_path / "out"), message)
     assert not (tmp_path / "out").exists()
 
 
-def test_verify_wants_grasps_in_the_world(run: Run, some_grasps: Path) -> None:
-    args = ["--object", "can_02", "--grasps", some_grasps / "camera.safetensors"]
+def test_files_of_the_first_edition_are_read_in_the_world_frame_only(
+    run: Run, observed: list[object], some_grasps: Path, tmp_path: Path
+) -> None:
+    grasps = Grasps.load(some_grasps)
+    kind = grasps.grasp_type[:, None, None].expand(-1, 10, 1)
+    waypoints = torch.cat((grasps.wrist, grasps.joints, kind), -1).contiguous()
+    for frame in ("world", "camera"):
+        save_file({"waypoints": waypoints}, tmp_path / frame, metadata={"frame": frame})
+    for args in (["refine", *observed, "--num_steps", 0], ["verify", "--object", "can_07"]):
+        first, new = (run(*args, "--grasps", path, "--json") for path in (tmp_path / "world", some_grasps))
+        assert first == new
+        assert first[0] == 0
+        message = "the grasps are in the camera frame, expected the world frame"
+        refused(run(*args, "--grasps", tmp_path / "camera"), message)
+
+
+def test_hands_that_do_not_fit_get_one_line(
+    run: Run, observed: list[object], some_grasps: Path, tmp_path: Path
+) -> None:
+    refused(run("plan", *observed, "--hand", "claw"), "claw")
+    grasps, left = Grasps.load(some_grasps), Hand.load("dlr2", "left")
+    Grasps.of(grasps.trajectory, left).save(tmp_path / "left")
+    message = "evaluator em2 knows the hand dlr2 (right), not dlr2 (left)"
+    refused(run("refine", *observed, "--grasps", tmp_path / "left"), message)
+    unknown = {"frame": "world", "hand": "claw", "side": "right", "digest": "0"}
+    save_file(load_file(some_grasps), tmp_path / "claw", metadata=unknown)
     refused(
-        run("verify", *args), "camera.safetensors holds grasps in the camera frame; save them with to_frame('world'"
+        run("verify", "--object", "can_02", "--grasps", tmp_path / "claw"), "a hand 'claw', which is not in robots/"
     )
+    save_file(load_file(some_grasps), tmp_path / "changed", metadata=unknown | {"hand": "dlr2"})
+    refused(run("verify", "--object", "can_02", "--grasps", tmp_path / "changed"), "(right) as it is now")
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: trimesh.creation.box([80.0, 60.0, 100.0]), "is 100.0 m large and looks like millimetres"),
+        (lambda: trimesh.creation.box([80.0, 60.0, 100.0]), "is 100.0 m large and looks like millimeters"),
         (lambda: trimesh.creation.box([0.1, 0.1, 1e-6]), "is flat"),
     ],
-    ids=["millimetres", "flat"],
+    ids=["millimeters", "flat"],
 )
 def test_a_bad_mesh_gets_one_line(run: Run, tmp_path: Path, make: Callable[[], trimesh.Trimesh], message: str) -> None:
     make().export(tmp_path / "thing.stl")
@@ -480,11 +627,12 @@ def test_out_must_be_of_the_right_kind(
     run: Run, observed: list[object], some_grasps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is looked at before the work is done."""
-    monkeypatch.setattr(commands, "plan", lambda *_: pytest.fail("the work was done"))
+    monkeypatch.setattr(planning, "plan", lambda *_, **__: pytest.fail("the work was done"))
     (tmp_path / "file").write_text("kept")
     refused(run("plan", *observed, "--out", tmp_path / "file"), "file is a file; give a folder")
-    refused(run("collect", "--out", tmp_path / "file"), "file is a file; give a folder")
-    args = ["--grasps", some_grasps / "camera.safetensors", "--out", tmp_path]
+    for command in ("collect", "collect_refined", "compare", "demonstrate"):
+        refused(run(command, "--out", tmp_path / "file"), "file is a file; give a folder")
+    args = ["--grasps", some_grasps, "--out", tmp_path]
     refused(run("refine", *observed, *args), f"--out {tmp_path} is a folder; give a file")
     refused(
         run("refine", *observed, *args[:2], "--picture", tmp_path), f"--picture {tmp_path} is a folder; give a file"
@@ -495,17 +643,17 @@ def test_out_must_be_of_the_right_kind(
 def test_failures_of_the_machine_are_status_1(
     run: Run, observed: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError("no space left\non the device")
 
-    monkeypatch.setattr(commands, "plan", full)
+    monkeypatch.setattr(planning, "plan", full)
     status, out, err = run("plan", *observed)
     assert (status, out, err) == (1, "", "dexzoo: no space left on the device\n")
 
-    def stopped(*_: object) -> None:
+    def stopped(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "plan", stopped)
+    monkeypatch.setattr(planning, "plan", stopped)
     assert run("plan", *observed) == (1, "", "dexzoo: stopped\n")
 
 

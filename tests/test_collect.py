@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 import torch
 
-from dexzoo.camera import Observation
-from dexzoo.data import collect as module
-from dexzoo.data.collect import Configuration, collect, make_scene, object_of
+from dexzoo.collection import collect as module
+from dexzoo.collection.collect import Configuration, collect, make_scene, object_of
+from dexzoo.collection.neighbors import choose, perturb
+from dexzoo.collection.rendering import rebuild, render
+from dexzoo.collection.workers import in_processes
 from dexzoo.data.grasp_set import GraspSet
-from dexzoo.data.neighbours import choose, perturb
-from dexzoo.data.rendering import rebuild
-from dexzoo.data.workers import in_processes
 from dexzoo.data.writer import SceneRows
 from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import GRIP, PREGRASP, SQUEEZE, Grasps
@@ -32,7 +31,7 @@ SMALL = Configuration(seed=3, num_grasps=10, num_views=2)
 
 def make_small(patch: pytest.MonkeyPatch) -> None:
     """Few grasps of two objects, made in this process."""
-    patch.setattr(module, "make_generator", lambda name: HeuristicGenerator(num_samples=300))
+    patch.setattr(module, "make_generator", lambda name, hand: HeuristicGenerator(hand, num_samples=300))
     patch.setattr(module, "object_of", lambda number, split: ("can_02", "box_04")[number % 2])
     patch.setattr(module, "in_processes", lambda function, numbers, workers: map(function, numbers))
 
@@ -54,7 +53,7 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def read(collected: Path, tmp_path_factory: pytest.TempPathFactory) -> GraspSet:
-    return GraspSet(collected, tmp_path_factory.mktemp("cache"))
+    return GraspSet(collected, tmp_path_factory.mktemp("cache"), render)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -177,11 +176,11 @@ def test_rows_say_what_was_done(read: GraspSet, hand: Hand) -> None:
     np.testing.assert_array_equal(np.isfinite(read.grasps["shift"].to_numpy()), read.success)
 
 
-def test_what_is_read_is_what_was_tried(read: GraspSet, hand: Hand) -> None:
+def test_what_is_read_is_what_was_tried(read: GraspSet) -> None:
     """Scene and grasps made again from the files give the labels of the files, numbers and all."""
     for number, row in enumerate(read.scenes.to_pylist()):
         here = np.flatnonzero(read.grasp_scene == number)
-        again = trial.run(rebuild(row), Grasps(read.world_grasps.waypoints[torch.tensor(here)], "world"), hand, 1)
+        again = trial.run(rebuild(row), read.world_grasps[here], 1)
         np.testing.assert_array_equal(again.success, read.success[here])
         np.testing.assert_array_equal(again.shift, read.grasps["shift"].to_numpy()[here])
 
@@ -195,6 +194,11 @@ def test_views_are_rendered_again_as_they_were(read: GraspSet) -> None:
         np.testing.assert_array_equal(seen.T_world_camera, expected.T_world_camera)
         np.testing.assert_array_equal(seen.mask, expected.mask)
         np.testing.assert_allclose(seen.depth[seen.mask], expected.depth[seen.mask], atol=0.51e-4)
+
+
+def test_views_without_images_need_a_renderer(collected: Path) -> None:
+    with pytest.raises(ValueError, match="keeps no images; open it with a renderer"):
+        GraspSet(collected).depth([0])
 
 
 @pytest.mark.usefixtures("small")
@@ -221,7 +225,7 @@ def test_scenes_that_give_up_are_kept_as_such(tmp_path: Path, monkeypatch: pytes
     def restless(*_: object) -> None:
         raise ValueError("it rolls")
 
-    monkeypatch.setattr(module, "make_generator", lambda name: Hopeless())
+    monkeypatch.setattr(module, "make_generator", lambda name, hand: Hopeless())
     assert list(collect(tmp_path, SMALL, 1)) == ["scene 0 can_02: skipped, fewer than 10 grasps are generated"]
     monkeypatch.setattr(module.Scene, "place", restless)
     assert list(collect(tmp_path, SMALL, 2))[1] == "scene 1 box_04: skipped, the object does not come to rest"
@@ -236,7 +240,7 @@ def test_scenes_that_give_up_are_kept_as_such(tmp_path: Path, monkeypatch: pytes
 
 @pytest.mark.usefixtures("small")
 def test_a_scene_without_a_success_is_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module.trial, "run", lambda scene, grasps, hand, num_threads: trial.Outcomes.none(len(grasps)))
+    monkeypatch.setattr(module.trial, "run", lambda scene, grasps, num_threads: trial.Outcomes.none(len(grasps)))
     rows = make_scene(SMALL, 0)
     scene = rows["scenes"].to_pylist()[0]
     assert (scene["skipped"], scene["generated"], scene["held"]) == ("no generated grasp holds", 10, 0)
@@ -279,19 +283,14 @@ def test_any_first_scenes_have_the_categories_in_proportion() -> None:
         assert all(abs(seen[kind] - count * share[kind] / len(names)) <= 1 for kind in share)
 
 
-# neighbours
+# neighbors
 
 
-@pytest.fixture(scope="module")
-def world(can_grasps: Grasps, can_view: Observation) -> Grasps:
-    return can_grasps.to_frame("world", can_view.T_world_camera)
-
-
-def test_neighbours_are_near_and_valid(world: Grasps, hand: Hand) -> None:
-    original = world[np.repeat(np.arange(len(world)), 4)]
-    near = perturb(original, hand, np.random.default_rng(0))
+def test_neighbors_are_near_and_valid(can_grasps: Grasps, hand: Hand) -> None:
+    original = can_grasps[np.repeat(np.arange(len(can_grasps)), 4)]
+    near = perturb(original, np.random.default_rng(0))
     assert len(near) == len(original)
-    assert near.frame == "world"
+    assert near.hand == hand
     assert torch.equal(near.grasp_type, original.grasp_type)
     distance = (near.position[:, GRIP] - original.position[:, GRIP]).norm(dim=-1)
     assert float(distance.min()) >= 0.002 - 1e-6
@@ -319,7 +318,7 @@ def test_neighbours_are_near_and_valid(world: Grasps, hand: Hand) -> None:
     ("success", "around_held"),
     [([True, True, True, False, False], 20), ([True, False], 8), ([False, False], 0), ([True, True], 30)],
 )
-def test_neighbours_are_sought_around_those_that_hold(success: list[bool], around_held: int) -> None:
+def test_neighbors_are_sought_around_those_that_hold(success: list[bool], around_held: int) -> None:
     index = choose(np.array(success), 30, np.random.default_rng(0))
     assert len(index) == 30
     assert np.array(success)[index].sum() == around_held

@@ -17,15 +17,16 @@ from torch import Tensor, nn
 from dexzoo.comparison.compare import compare, load_models
 from dexzoo.comparison.inside import draw_inside, feature_maps, grasp_features, principal_components
 from dexzoo.comparison.report import advice, category_table, main_table, markdown, terminal_table, write
-from dexzoo.comparison.scores import encoded_views, first_image, measure, model_scores
+from dexzoo.comparison.scores import encoded_views, first_image, measure, model_scores, one_view
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
-from dexzoo.grasp import JOINTS, SQUEEZE, Grasps
-from dexzoo.hand import default_hand
+from dexzoo.grasp import SQUEEZE, Trajectory
+from dexzoo.hand import Hand
+from dexzoo.models.batch import Encoding
 from dexzoo.models.em1 import EM1
 from dexzoo.models.em2 import EM2
 from dexzoo.models.ensemble import Ensemble
-from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
+from dexzoo.models.evaluator import EvaluatorOptions, GraspEvaluator
 
 ROOT = Path(__file__).parent.parent
 
@@ -35,21 +36,24 @@ class Closure(GraspEvaluator):
 
     architecture: ClassVar[str] = "closure"
 
-    def __init__(self, gain: float = 50.0, **training: Unpack[TrainingOptions]) -> None:
-        super().__init__(**training)
+    def __init__(self, gain: float = 50.0, **options: Unpack[EvaluatorOptions]) -> None:
+        super().__init__(**options)
         self.gain = gain
         self.head = nn.Linear(15, 1)
         nn.init.constant_(self.head.weight, gain / 15)
         nn.init.constant_(self.head.bias, -gain * synthetic.CLOSED)
 
-    def encode(self, images: Tensor) -> Scene:
+    def encode(self, images: Tensor) -> Encoding:
         return {"nothing": images.new_zeros(len(images), 1)}
 
-    def logit(self, scene: Scene, grasps: Tensor) -> Tensor:
-        hand = default_hand()
-        low, high = hand.reduce(hand.lower), hand.reduce(hand.upper)
-        share = (hand.reduce(grasps[:, :, SQUEEZE, JOINTS]) - low) / (high - low)
-        return self.head(share)[..., 0]
+    def logit(self, encoding: Encoding, grasps: Trajectory) -> Tensor:
+        return self.head(closed(self.known_hands[0], grasps))[..., 0]
+
+
+def closed(hand: Hand, grasps: Trajectory) -> Tensor:
+    """Share of its range at which each freedom ends."""
+    low, high = hand.reduce(hand.lower), hand.reduce(hand.upper)
+    return (hand.reduce(grasps.joints[..., SQUEEZE, :]) - low) / (high - low)
 
 
 @pytest.fixture(scope="module")
@@ -132,14 +136,13 @@ def test_each_grasp_is_scored_in_its_own_view(data: GraspDataModule) -> None:
     torch.manual_seed(0)
     model = EM2(width=16, gain=1.5)  # a gain that lets grasps come through an untrained network
     source = data.source
-    model.fit_statistics(source.images([0, 1])[torch.arange(2)], data.waypoints)
+    model.fit_statistics(source.images([0, 1])[torch.arange(2)], data.aimed_grasps)
     model.eval()
     scores = model_scores(model, data.dataset("validation", model), "scoring")
     rows = np.flatnonzero((source.grasp_scene == 4) & (source.source == "generated"))
     assert len(np.unique(source.grasp_view[rows])) == 2
     for row, probability in zip(rows[::5], scores.probability[::5], strict=True):
-        grasp = Grasps(source.world_grasps.waypoints[[row]], "world")
-        expected = model.score(source.observation(int(source.grasp_view[row])), grasp)
+        expected = model.score(source.world_grasps[row], source.observation(int(source.grasp_view[row])))
         assert probability == pytest.approx(float(expected), abs=2e-3)  # views are cached in half precision
     assert np.ptp(scores.probability) > 0.02
 
@@ -262,22 +265,22 @@ def summary(top1: dict[str, float], held: tuple[int, int], p: float) -> dict[str
             (40, 12),
             0.0003,
             "Use a: a's first grasp holds in 90.0 % of the scenes, 10.0 points more than b's (only a's in 40 scenes, ",
-            "only b's in 12), which is beyond chance (p 0.0003).",
+            "only b's in 12); the difference is significant (p 0.0003).",
         ),
         (
             {"a": 0.9, "b": 0.8, "gm": 0.5},
             (5, 2),
             0.4531,
             "Use b: a's first grasp holds in 90.0 % of the scenes, 10.0 points more than b's (only a's in 5 scenes, ",
-            "only b's in 2), which may be chance (p 0.4531), and b is the quicker, 840 ms for a view and 1,000 grasps "
-            "against 940.",
+            "only b's in 2); the difference is not significant (p 0.4531), and b is faster (840 ms for a view and "
+            "1,000 grasps, against 940).",
         ),
         (
             {"a": 0.4, "gm": 0.5},
             (2, 30),
             1e-6,
             "a's first grasp holds in 40.0 % of the scenes, 10.0 points less than gm's (only a's in 2 scenes, only ",
-            "gm's in 30), which is beyond chance (p < 0.0001).",
+            "gm's in 30); the difference is significant (p < 0.0001).",
         ),
     ],
 )
@@ -296,7 +299,7 @@ def test_the_sentence_doubts_what_is_not_surely_better_than_the_generator(
     result = summary({"a": 0.9, "b": 0.8, "gm": value}, (40, 12), 0.0003)
     rows = result["sources"]["generated"]["rows"]
     rows["a"]["against_gm"] = {"top1": {"p": p, "difference": {"value": 0.9 - value}}}
-    doubt = " That a's order is better than gm's, the generator's own, may be chance (p "
+    doubt = " a is not significantly better than gm, the generator's own order (p "
     assert (doubt in advice(result)) == doubted
 
 
@@ -326,7 +329,7 @@ def test_all_are_set_against_em2_where_it_is_compared(
     assert page.count(line) == 1
 
 
-def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
+def test_a_look_inside(data: GraspDataModule, hand: Hand, tmp_path: Path) -> None:
     torch.manual_seed(0)
     em2 = EM2(width=16).eval()
     image = data.source.images([0])[torch.tensor([0])]
@@ -336,16 +339,12 @@ def test_a_look_inside(data: GraspDataModule, tmp_path: Path) -> None:
     rows, features = grasp_features(em2, dataset)
     joined = []
     em2.head.register_forward_hook(lambda _, given, __: joined.append(given[0][..., -512:]))
-    em2.logit(em2.encode(image), dataset.aimed(rows[:3])[None])
+    em2.logit(em2.encode(image), one_view(dataset.aimed(rows[:3])))
     torch.testing.assert_close(features[:3], joined[0][0], atol=1e-4, rtol=1e-4)
     em1 = EM1().eval()
     assert grasp_features(em1, data.dataset("test", em1))[1].shape == (len(rows), 1024)
     rows, features = grasp_features(Closure(), dataset)
-    hand = default_hand()
-    share = (hand.reduce(dataset.world_grasps[rows, SQUEEZE, JOINTS]) - hand.reduce(hand.lower)) / hand.reduce(
-        hand.upper - hand.lower
-    )
-    torch.testing.assert_close(features, share)
+    torch.testing.assert_close(features, closed(hand, dataset.grasps[rows]))
     drawn = draw_inside({"em2": em2, "runs/closure": Closure()}, data, "test", tmp_path)
     assert [path.name for path in drawn] == ["em2_maps.png", "em2_grasps.png", "runs_closure_grasps.png"]
     assert set(drawn) == set(tmp_path.glob("*.png"))

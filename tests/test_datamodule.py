@@ -1,16 +1,21 @@
+import shutil
 import time
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import synthetic
 import torch
 
-from dexzoo.data.datamodule import GraspDataModule, GraspDataset
+from dexzoo.data.batches import GraspDataset
+from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SOURCES, SPLITS
-from dexzoo.grasp import POSITION, Grasps, transform_waypoints
+from dexzoo.grasp import Trajectory
+from dexzoo.models.batch import Encoding
 from dexzoo.models.em2 import EM2
-from dexzoo.models.evaluator import GraspEvaluator, Scene
+from dexzoo.models.evaluator import GraspEvaluator
 
 
 class ImageEvaluator(GraspEvaluator):
@@ -22,11 +27,11 @@ class ImageEvaluator(GraspEvaluator):
         super().__init__()
         self.weight = torch.nn.Parameter(torch.zeros(2))
 
-    def encode(self, images: torch.Tensor) -> Scene:
+    def encode(self, images: torch.Tensor) -> Encoding:
         return {"mean": images.mean((2, 3)) @ self.weight}
 
-    def logit(self, scene: Scene, grasps: torch.Tensor) -> torch.Tensor:
-        return scene["mean"][:, None] + grasps[..., 2].mean(-1)
+    def logit(self, encoding: Encoding, grasps: Trajectory) -> torch.Tensor:
+        return encoding["mean"][:, None] + grasps.position[..., 2].mean(-1)
 
 
 @pytest.fixture(scope="module")
@@ -50,16 +55,16 @@ def test_batches_hold_each_grasp_once_in_its_own_view(data: GraspDataModule, em2
     source = data.source
     rows = np.flatnonzero(source.grasp_split == SPLITS.index("test"))
     batches = list(data.loader(data.dataset("test", em2)))
-    grasps = torch.cat([batch.grasps for batch in batches])
-    assert grasps.shape == (len(rows), 1, 10, 28)
+    grasps = Trajectory.cat([batch.grasps for batch in batches])
+    assert grasps.wrist.shape == (len(rows), 10, 7)
+    assert torch.equal(grasps.joints, source.world_grasps.joints[rows])
+    assert torch.equal(grasps.grasp_type, source.world_grasps.grasp_type[rows])
     assert torch.cat([batch.success for batch in batches]).tolist() == source.success[rows].tolist()
     assert torch.cat([batch.scene_index for batch in batches]).tolist() == source.grasp_scene[rows].tolist()
     for i in (0, 17, len(rows) - 1):
         observation = source.observation(int(source.grasp_view[rows[i]]))
-        expected = Grasps(source.world_grasps.waypoints[rows[i], None], "world")
-        torch.testing.assert_close(
-            grasps[i], expected.to_frame("camera", observation.T_world_camera).waypoints, atol=1e-5, rtol=0
-        )
+        expected = source.world_grasps[rows[i]].transformed(np.linalg.inv(observation.T_world_camera))
+        torch.testing.assert_close(grasps[i].wrist, expected.wrist, atol=1e-5, rtol=0)
         features = em2.encode(observation.image()[None])["features"][0]
         batch, row = divmod(i, 16)
         views = batches[batch].views
@@ -84,21 +89,21 @@ def test_training_sees_a_grasp_in_all_views_of_its_scene(data: GraspDataModule, 
     batches = data.loader(dataset, balanced=True)
     for batch in [batch for _ in range(6) for batch in batches]:
         assert isinstance(batch.views, dict)
-        for place, grasp, scene in zip(batch.view, batch.grasps, batch.scene_index, strict=True):
+        for place, grasp, scene in zip(batch.view, batch.grasps.split(1), batch.scene_index, strict=True):
             feature = batch.views["features"][place]
             (view,) = (dataset.views["features"] == feature).all(1).nonzero()[:, 0].tolist()
             assert dataset.view_scene[view] == scene
-            world = transform_waypoints(torch.linalg.inv(dataset.T_aimed_world[view]), grasp)
-            (row,) = np.flatnonzero((source.grasp_scene == int(scene)) & near(source.world_grasps.waypoints, world))
+            world = grasp.transformed(torch.linalg.inv(dataset.T_aimed_world[view]))
+            (row,) = np.flatnonzero((source.grasp_scene == int(scene)) & near(source.world_grasps, world))
             found.setdefault(int(row), set()).add(view)
     assert set(found) <= set(rows.tolist())
     assert len(found) > 0.9 * len(rows)
     assert np.mean([len(views) == 2 for views in found.values()]) > 0.8
 
 
-def near(grasps: torch.Tensor, grasp: torch.Tensor) -> np.ndarray:
+def near(grasps: Trajectory, grasp: Trajectory) -> np.ndarray:
     """Which grasps are the same, whatever the signs of their quaternions."""
-    return ((grasps[..., POSITION] - grasp[..., POSITION]).abs().flatten(1).amax(1) < 1e-5).numpy()
+    return ((grasps.position - grasp.position).abs().flatten(1).amax(1) < 1e-5).numpy()
 
 
 def test_views_are_encoded_once_ever(
@@ -140,13 +145,13 @@ def test_a_trained_encoder_gets_images(data: GraspDataModule) -> None:
 def test_batches_are_loaded_at_once() -> None:
     data = GraspDataModule(batch_size=128)
     count = 20_480
-    scene = {"features": torch.zeros(100, 512, dtype=torch.float16)}
+    encoding = {"features": torch.zeros(100, 512, dtype=torch.float16)}
     dataset = GraspDataset(
-        torch.ones(count, 10, 28),
+        Trajectory(torch.ones(count, 10, 7), torch.ones(count, 10, 20), torch.zeros(count, dtype=torch.long)),
         (torch.arange(count) % 2).float(),
         torch.arange(count) % 25,
         torch.arange(count) % 100,
-        scene,
+        encoding,
         torch.arange(100) % 25,
         torch.eye(4).expand(100, 4, 4),
     )
@@ -180,6 +185,22 @@ def test_wrong_data_is_named(folder: Path, em2: EM2, tmp_path: Path) -> None:
         data.loader(dataset, balanced=True)
 
 
+def test_views_without_images_are_left_to_the_renderer(data: GraspDataModule, tmp_path: Path) -> None:
+    depth = data.source.depth(range(12))
+    bare = shutil.copytree(data.folder, tmp_path / "bare")
+    (bare / "manifest.json").unlink()
+    path = bare / "views" / "00000.parquet"
+    views = pq.read_table(path)
+    for name, values in (("depth", [None] * 12), ("seed", range(12))):
+        place = views.schema.get_field_index(name)
+        views = views.set_column(place, views.field(name), pa.array(values, views.field(name).type))
+    pq.write_table(views, path)
+    module = GraspDataModule(str(bare), cache=str(tmp_path))
+    module.renderer = lambda scene, seeds, cache: [depth[seed] for seed in seeds]
+    images = module.dataset("test", ImageEvaluator()).views[torch.arange(2)]
+    assert torch.equal(images, data.dataset("test", ImageEvaluator()).views[torch.arange(2)])
+
+
 def test_a_folder_is_also_looked_up_beside_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert Path(GraspDataModule("robots/dlr2").folder).is_dir()
@@ -200,10 +221,13 @@ def test_a_share_of_the_training_scenes(folder: Path, em2: EM2, tmp_path: Path) 
     assert data.dataset("train", em2).scene_index.unique().tolist() == [0, 1]  # 0.6 of four, rounded
     assert data.describe()["train_grasps"] == 80
     for split in ("validation", "test"):
-        assert torch.equal(data.dataset(split, em2).world_grasps, whole.dataset(split, em2).world_grasps)
+        part, all_of_it = (module.dataset(split, em2).grasps for module in (data, whole))
+        assert torch.equal(part.wrist, all_of_it.wrist)
+        assert torch.equal(part.joints, all_of_it.joints)
+        assert torch.equal(part.grasp_type, all_of_it.grasp_type)
     statistics = EM2(width=16)
     data.fit_statistics(statistics)
-    expected = whole.waypoints[torch.from_numpy(whole.source.grasp_scene) < 2]
+    expected = whole.aimed_grasps[torch.from_numpy(whole.source.grasp_scene) < 2]
     torch.testing.assert_close(statistics.grasp_vector.mean, statistics.grasp_vector.flatten(expected).mean(0))
 
 

@@ -8,43 +8,45 @@ import pytest
 import torch
 import trimesh
 
-from dexzoo.generators.demonstration import SHIPPED, Demonstration, distinct, load_demonstrations
-from dexzoo.generators.preshape import SQUEEZE, close, read_preshapes, read_recording
-from dexzoo.grasp import GRASP_TYPES, GRIP, PREGRASP
-from dexzoo.grasp import SQUEEZE as SQUEEZE_WAYPOINT
+from dexzoo.generators.demonstration import Demonstration, distinct, load_demonstrations, shipped_demonstrations
+from dexzoo.generators.preshape import SQUEEZE_TRAVEL, close, read_preshapes, read_recording
+from dexzoo.grasp import GRASP_TYPES, GRIP, PREGRASP, SQUEEZE, Grasps
 from dexzoo.hand import Hand
 from dexzoo.sim import Scene
 from dexzoo.sim.shapes import make_object, split_of
 from dexzoo.verification import verify
 
-PRESHAPES = SHIPPED / "preshapes.yaml"
 
-
-def test_ten_types_are_shown_on_six_training_objects() -> None:
-    shown = load_demonstrations()
+def test_ten_types_are_shown_on_six_training_objects(hand: Hand) -> None:
+    shown = load_demonstrations(hand)
     assert sorted(one.grasp_type for one in shown) == list(range(10))
     assert len({one.object for one in shown}) == 6
     assert all(split_of(one.object) == "train" for one in shown)
 
 
 def test_what_is_shipped_is_what_the_preshapes_make(hand: Hand) -> None:
-    shown = {one.grasp_type: one for one in load_demonstrations()}
-    for preshape in read_preshapes(PRESHAPES, hand)[:3]:
+    shown = {one.grasp_type: one for one in load_demonstrations(hand)}
+    for preshape in read_preshapes(shipped_demonstrations(hand) / "preshapes.yaml", hand)[:3]:
         made = close(preshape, make_object(preshape.object).mesh, hand)
-        torch.testing.assert_close(made.waypoints, shown[preshape.grasp_type].grasp.waypoints, atol=1e-4, rtol=0)
+        grasp = shown[preshape.grasp_type].grasp
+        torch.testing.assert_close(made.wrist, grasp.wrist, atol=1e-4, rtol=0)
+        torch.testing.assert_close(made.joints, grasp.joints, atol=1e-4, rtol=0)
+        assert torch.equal(made.grasp_type, grasp.grasp_type)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", GRASP_TYPES)
-def test_a_demonstration_lifts_its_object(kind: str) -> None:
-    one = next(d for d in load_demonstrations() if d.grasp_type == GRASP_TYPES.index(kind))
+def test_a_demonstration_lifts_its_object(kind: str, hand: Hand) -> None:
+    one = next(d for d in load_demonstrations(hand) if d.grasp_type == GRASP_TYPES.index(kind))
     scene = Scene.place(make_object(one.object), seed=0)
-    outcomes = verify(one.grasp.moved(scene.T_world_object), scene, seed=0, trials=10)
+    outcomes = verify(one.grasp.transformed(scene.T_world_object), scene, seed=0, trials=10)
     assert outcomes.success_rate[0] >= 0.9
 
 
 def test_fingers_stop_where_they_touch(hand: Hand) -> None:
-    preshape = next(p for p in read_preshapes(PRESHAPES, hand) if p.object == "box_09")
+    preshape = next(
+        p for p in read_preshapes(shipped_demonstrations(hand) / "preshapes.yaml", hand) if p.object == "box_09"
+    )
     box = make_object("box_09")
     grasp = close(preshape, box.mesh, hand)
     links = grasp.wrist_pose[0, GRIP].double() @ hand.forward_kinematics(grasp.joints[0, GRIP].double())
@@ -53,43 +55,57 @@ def test_fingers_stop_where_they_touch(hand: Hand) -> None:
     assert distance.min() > -0.004, "no deeper than one step of closing"
     thumb = [i for i, name in enumerate(hand.solid_names) if name.startswith("thumb")]
     assert distance[thumb].min() < 0.001
-    came = (grasp.joints[0, SQUEEZE_WAYPOINT] - grasp.joints[0, GRIP]).abs().max()
-    assert came == pytest.approx(SQUEEZE, abs=1e-3)
+    came = (grasp.joints[0, SQUEEZE] - grasp.joints[0, GRIP]).abs().max()
+    assert came == pytest.approx(SQUEEZE_TRAVEL, abs=1e-3)
 
 
-def test_a_demonstration_comes_back_as_it_was_saved(tmp_path: Path) -> None:
-    one = load_demonstrations()[0]
+def test_a_demonstration_comes_back_as_it_was_saved(hand: Hand, tmp_path: Path) -> None:
+    one = load_demonstrations(hand)[0]
     one.save(tmp_path / "one.safetensors")
     back = Demonstration.load(tmp_path / "one.safetensors")
     assert back.object == one.object
-    assert torch.equal(back.grasp.waypoints, one.grasp.waypoints)
-    assert torch.equal(back.surface.points, one.surface.points)
+    for name in ("wrist", "joints", "grasp_type"):
+        assert torch.equal(getattr(back.grasp, name), getattr(one.grasp, name))
+    for name in ("points", "quaternion", "curvature"):
+        assert torch.equal(getattr(back.surface, name), getattr(one.surface, name))
+    assert back.grasp.hand == hand
 
 
-def test_near_equal_demonstrations_are_merged() -> None:
-    first, second = load_demonstrations()[:2]
+def test_a_demonstration_of_another_hand_is_refused(hand: Hand, tmp_path: Path) -> None:
+    left, one = Hand.load(side="left"), load_demonstrations(hand)[0]
+    Demonstration(one.object, Grasps.of(one.grasp.trajectory, left), one.surface).save(tmp_path / "one.safetensors")
+    assert load_demonstrations(left, str(tmp_path))[0].grasp.hand is left
+    with pytest.raises(ValueError, match=r"one.safetensors: .* the hand dlr2 \(left\), not of dlr2 \(right\)"):
+        load_demonstrations(hand, str(tmp_path))
+
+
+def test_near_equal_demonstrations_are_merged(hand: Hand) -> None:
+    first, second = load_demonstrations(hand)[:2]
     assert distinct([first, second, first], max_per_type=5) == [first, second]
     assert distinct([first, second], max_per_type=0) == []
 
 
 def test_a_grasp_beside_the_object_is_no_demonstration(hand: Hand) -> None:
-    one = load_demonstrations()[0]
+    one = load_demonstrations(hand)[0]
     away = np.eye(4)
     away[2, 3] = 0.5
     with pytest.raises(ValueError, match=r"the hand is \d+ mm from the object at the grip"):
-        Demonstration.record(one.grasp.moved(away), make_object(one.object).mesh, hand, one.object)
+        Demonstration.record(one.grasp.transformed(away), make_object(one.object).mesh, one.object)
 
 
 def test_a_recording_is_read(hand: Hand, tmp_path: Path) -> None:
-    grasp = load_demonstrations()[0].grasp
+    grasp = load_demonstrations(hand)[0].grasp
+    ends = [PREGRASP, GRIP]
     waypoints = [
-        {"position": w[:3].tolist(), "quaternion": w[3:7].tolist(), "joints": w[7:27].tolist()}
-        for w in grasp.waypoints[0, [PREGRASP, GRIP]]
+        {"position": wrist[:3].tolist(), "quaternion": wrist[3:].tolist(), "joints": joints.tolist()}
+        for wrist, joints in zip(grasp.wrist[0, ends], grasp.joints[0, ends], strict=True)
     ]
     path = tmp_path / "grasp.json"
     path.write_text(json.dumps({"grasp_type": GRASP_TYPES[int(grasp.grasp_type[0])], "waypoints": waypoints}))
     read = read_recording(path, hand)
-    torch.testing.assert_close(read.waypoints, grasp.waypoints, atol=1e-4, rtol=0)
+    torch.testing.assert_close(read.wrist, grasp.wrist, atol=1e-4, rtol=0)
+    torch.testing.assert_close(read.joints, grasp.joints, atol=1e-4, rtol=0)
+    assert torch.equal(read.grasp_type, grasp.grasp_type)
 
 
 @pytest.mark.parametrize(
@@ -123,11 +139,14 @@ def test_bad_preshapes_are_refused(text: str, message: str, hand: Hand, tmp_path
         read_preshapes(path, hand)
 
 
-def test_what_is_no_demonstration_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_demonstration_is_refused(hand: Hand, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="does not exist"):
         Demonstration.load(tmp_path / "none.safetensors")
     (tmp_path / "bad.safetensors").write_bytes(b"12345678901")
     with pytest.raises(ValueError, match="is no demonstration"):
         Demonstration.load(tmp_path / "bad.safetensors")
+    load_demonstrations(hand)[0].grasp.save(tmp_path / "grasps.safetensors")
+    with pytest.raises(ValueError, match="is no demonstration: it has no 'points'"):
+        Demonstration.load(tmp_path / "grasps.safetensors")
     with pytest.raises(FileNotFoundError, match="holds no demonstration"):
-        load_demonstrations(str(tmp_path / "empty"))
+        load_demonstrations(hand, str(tmp_path / "empty"))

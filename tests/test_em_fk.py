@@ -1,25 +1,29 @@
 """EM-FK: where the hand's points are, what they are told of the view, and that nothing breaks at the edges."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import synthetic
 import torch
 
 from dexzoo import rotation
-from dexzoo.camera import Observation
-from dexzoo.grasp import Grasps
+from dexzoo.comparison.scores import one_view
+from dexzoo.grasp import Grasps, Trajectory
 from dexzoo.hand import Hand
+from dexzoo.hand.surface_points import surface_points
 from dexzoo.models import em_fk
 from dexzoo.models.em_fk import EMFK
-from dexzoo.models.hand_points import surface_points
 from dexzoo.models.view_geometry import cloud, table_plane, upright_axes, view_geometry
+from dexzoo.perception.camera import look_at
+from dexzoo.perception.observation import Observation
 
 RADIUS = 0.05
-CENTRE = np.array([0.1, -0.2, RADIUS])
+CENTER = np.array([0.1, -0.2, RADIUS])
 
 
 def ball(azimuth: float, distance: float = 0.5, elevation: float = 0.8) -> Observation:
-    return synthetic.render("ball", np.full(3, RADIUS), CENTRE, synthetic.look_at(CENTRE, distance, azimuth, elevation))
+    return synthetic.render("ball", np.full(3, RADIUS), CENTER, look_at(CENTER, distance, azimuth, elevation))
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +34,11 @@ def model() -> EMFK:
 
 @pytest.fixture(scope="module")
 def grasps() -> Grasps:
-    return synthetic.draw_grasps(CENTRE, 12, np.random.default_rng(0))[0]
+    return synthetic.draw_grasps(CENTER, 12, np.random.default_rng(0))[0]
 
 
-def camera_grasps(grasps: Grasps, view: Observation) -> torch.Tensor:
-    return grasps.to_frame("camera", view.T_world_camera).waypoints[None]
+def camera_grasps(grasps: Grasps, view: Observation) -> Trajectory:
+    return one_view(grasps.trajectory.transformed(np.linalg.inv(view.T_world_camera)))
 
 
 # the hand's points
@@ -46,7 +50,7 @@ def test_points_lie_on_the_hand_and_face_what_is_grasped(hand: Hand) -> None:
     links = hand.forward_kinematics(torch.zeros(20, dtype=torch.float64))
     poses = hand.shape_poses(links)
     own = torch.tensor([hand.solid_names.index(shape.link) for shape in hand.shapes])
-    for lift in (0.0, 1e-3):  # on the surface; and a millimetre along the normal is a millimetre away from it
+    for lift in (0.0, 1e-3):  # on the surface; and a millimeter along the normal is a millimeter away from it
         placed = (points + lift * normals) @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
         distance = hand.signed_distance(links, placed.reshape(-1, 3)).reshape(len(hand.solid_names), -1, 6)
         nearest = distance[own, torch.arange(len(own))]
@@ -65,10 +69,8 @@ def test_points_lie_on_the_hand_and_face_what_is_grasped(hand: Hand) -> None:
 def test_the_table_is_found_in_the_image_again() -> None:
     for shape, half in (("ball", [0.03] * 3), ("box", [0.06, 0.04, 0.002]), ("box", [0.02, 0.02, 0.1])):
         for azimuth, elevation in ((0.3, 0.55), (2.0, 1.0), (4.0, 1.4)):
-            centre = np.array([0.0, 0.1, half[2]])
-            view = synthetic.render(
-                shape, np.array(half), centre, synthetic.look_at(centre, 0.6, azimuth, elevation)
-            ).aimed()
+            center = np.array([0.0, 0.1, half[2]])
+            view = synthetic.render(shape, np.array(half), center, look_at(center, 0.6, azimuth, elevation)).aimed()
             found = table_plane(view.image()[None])[0].double().numpy()
             assert np.linalg.norm(found[:3]) == pytest.approx(1)
             assert np.rad2deg(np.arccos(min(1, found[:3] @ view.table[:3]))) < 0.5
@@ -81,7 +83,7 @@ def test_surface_normals_and_cloud_are_those_of_a_ball() -> None:
     view = ball(1.0).aimed()
     geometry = view_geometry(view.image()[None])
     T = torch.linalg.inv(torch.tensor(view.T_world_camera))
-    middle = (T[:3, :3] @ torch.tensor(CENTRE) + T[:3, 3]).float()
+    middle = (T[:3, :3] @ torch.tensor(CENTER) + T[:3, 3]).float()
     seen = cloud(geometry, 256)[0]
     out = seen[:, :3] - middle
     torch.testing.assert_close(out.norm(dim=1), torch.full((256,), RADIUS), atol=2e-3, rtol=0)
@@ -138,21 +140,20 @@ def test_turning_camera_and_grasps_about_a_ball_changes_nothing(model: EMFK, gra
     for azimuth in (0.0, 1.0, 3.0):
         turn = torch.eye(4, dtype=torch.float64)
         turn[:3, :3] = rotation.to_matrix(rotation.exp(torch.tensor([0, 0, azimuth], dtype=torch.float64)))
-        turn[:3, 3] = torch.tensor(CENTRE) - turn[:3, :3] @ torch.tensor(CENTRE)
-        scores.append(model.score(ball(azimuth), grasps.moved(turn)))
+        turn[:3, 3] = torch.tensor(CENTER) - turn[:3, :3] @ torch.tensor(CENTER)
+        scores.append(model.score(grasps.transformed(turn), ball(azimuth)))
     torch.testing.assert_close(scores[1], scores[0], atol=1e-3, rtol=0)
     torch.testing.assert_close(scores[2], scores[0], atol=1e-3, rtol=0)
 
 
 def test_batches_change_nothing(model: EMFK, grasps: Grasps) -> None:
     views = [ball(azimuth) for azimuth in (0.0, 2.0)]
-    waypoints = torch.cat([camera_grasps(grasps, view) for view in views])
-    scene = model.encode(torch.stack([view.image() for view in views]))
-    whole = model.logit(scene, waypoints)
+    encoding = model.encode(torch.stack([view.image() for view in views]))
+    whole = model.logit(encoding, Trajectory.cat([camera_grasps(grasps, view) for view in views]))
     for i, view in enumerate(views):
         alone = model.encode(view.image()[None])
         for j in range(len(grasps)):
-            one = model.logit(alone, waypoints[i : i + 1, j : j + 1])
+            one = model.logit(alone, camera_grasps(grasps[j], view))
             torch.testing.assert_close(one[0, 0], whole[i, j], atol=1e-5, rtol=0)
 
 
@@ -161,15 +162,16 @@ def test_anywhere_before_or_behind_the_camera_all_is_finite(
     model: EMFK, grasps: Grasps, shift: tuple[float, float, float]
 ) -> None:
     view = ball(0.0)
-    scene = model.encode(view.image()[None])
-    waypoints = camera_grasps(grasps, view).clone()
-    waypoints[..., :3] = torch.tensor(shift)
-    waypoints.requires_grad_()
-    logit = model.logit(scene, waypoints)
-    (slope,) = torch.autograd.grad(logit.sum(), waypoints)
+    encoding = model.encode(view.image()[None])
+    seen = camera_grasps(grasps, view)
+    wrist, joints = seen.wrist.clone(), seen.joints.requires_grad_()
+    wrist[..., :3] = torch.tensor(shift)
+    wrist.requires_grad_()
+    logit = model.logit(encoding, replace(seen, wrist=wrist))
     assert torch.isfinite(logit).all()
-    assert torch.isfinite(slope).all()
-    assert slope.abs().max() < 1e4
+    for slope in torch.autograd.grad(logit.sum(), (wrist, joints)):
+        assert torch.isfinite(slope).all()
+        assert slope.abs().max() < 1e4
 
 
 def test_a_point_of_the_hand_on_a_point_of_the_cloud_has_a_slope(model: EMFK) -> None:
@@ -185,33 +187,37 @@ def test_what_points_are_told_follows_the_grasp_in_double_precision(model: EMFK,
     exact = EMFK().double().eval()
     exact.load_state_dict(model.state_dict())
     view = ball(0.0)
-    scene = {name: value.double() for name, value in model.encode(view.image()[None]).items()}
-    waypoints = camera_grasps(grasps, view)[:, :3].double().requires_grad_()
+    encoding = {name: value.double() for name, value in model.encode(view.image()[None]).items()}
+    seen = camera_grasps(grasps[:3], view).to(torch.float64)
+    parts = (seen.wrist.requires_grad_(), seen.joints.requires_grad_())
     weight = torch.randn(53, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    way = torch.randn(waypoints.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    way[..., 27] = 0
+    generator = torch.Generator().manual_seed(2)
+    ways = [torch.randn(part.shape, generator=generator, dtype=torch.float64) for part in parts]
 
-    def told(w: torch.Tensor) -> torch.Tensor:
-        return (exact.look(scene, w) * weight).sum((0, 2, 3, 4, 5))  # one number for each grasp
+    def told(step: float) -> torch.Tensor:
+        wrist, joints = (part + step * way for part, way in zip(parts, ways, strict=True))
+        features = exact.look(encoding, Trajectory(wrist, joints, seen.grasp_type))
+        return (features * weight).sum((0, 2, 3, 4, 5))  # one number for each grasp
 
-    (slope,) = torch.autograd.grad(told(waypoints).sum(), waypoints)
+    slopes = torch.autograd.grad(told(0.0).sum(), parts)
     with torch.no_grad():
-        rise = (told(waypoints + 1e-8 * way) - told(waypoints - 1e-8 * way)) / 2e-8
+        rise = (told(1e-8) - told(-1e-8)) / 2e-8
     # at 1e-8 m no point crosses from one pixel, or nearest point, to the next but by rare chance
-    torch.testing.assert_close((slope * way).sum((0, 2, 3)), rise, rtol=1e-4, atol=1e-3)
+    expected = sum((slope * way).sum((0, 2, 3)) for slope, way in zip(slopes, ways, strict=True))
+    torch.testing.assert_close(expected, rise, rtol=1e-4, atol=1e-3)
 
 
-@pytest.mark.parametrize("without", ["image", "depth", "cloud", "table", "way", "attention"])
+@pytest.mark.parametrize("without", ["image", "depth", "cloud", "table", "motion", "attention"])
 def test_each_ingredient_can_be_left_out(without: str, grasps: Grasps) -> None:
     torch.manual_seed(0)
     model = EMFK(**{without: False}).eval()
     assert model.arguments[without] is False
     view = ball(0.0)
     size = 53 - em_fk.FEATURES.get(without, 0)
-    scene = model.encode(view.image()[None])
-    shape = (1, 12, 1 if without == "way" else 4, 19, 6, size)
-    assert model.look(scene, camera_grasps(grasps, view)).shape == shape
-    assert model.score(view, grasps).shape == (12,)
+    encoding = model.encode(view.image()[None])
+    shape = (1, 12, 1 if without == "motion" else 4, 19, 6, size)
+    assert model.look(encoding, camera_grasps(grasps, view)).shape == shape
+    assert model.score(grasps, view).shape == (12,)
     model.logit(model.encode(view.image()[None]), camera_grasps(grasps, view)).sum().backward()
     assert not [name for name, parameter in model.named_parameters() if parameter.grad is None]  # which ddp refuses
 

@@ -1,6 +1,7 @@
 """An ensemble is the mean of its members, and knows how far they are apart."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,6 @@ import synthetic
 import torch
 from safetensors.torch import load_file
 
-from dexzoo import training
-from dexzoo.camera import Observation, look_at
 from dexzoo.comparison import scores
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.grasp import Grasps
@@ -19,8 +18,11 @@ from dexzoo.models.em_fk import EMFK
 from dexzoo.models.ensemble import Ensemble
 from dexzoo.models.evaluator import GraspEvaluator
 from dexzoo.models.ffh import FFH
+from dexzoo.perception.camera import look_at
+from dexzoo.perception.observation import Observation
+from dexzoo.training.command_line import main
 
-CENTRE = np.array([0.0, 0, 0.04])
+CENTER = np.array([0.0, 0, 0.04])
 
 
 @pytest.fixture(scope="module")
@@ -36,40 +38,41 @@ def members(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 @pytest.fixture(scope="module")
 def view() -> Observation:
-    return synthetic.render("ball", np.full(3, 0.04), CENTRE, look_at(CENTRE, 0.5, 0.3, 0.8))
+    return synthetic.render("ball", np.full(3, 0.04), CENTER, look_at(CENTER, 0.5, 0.3, 0.8))
 
 
 @pytest.fixture(scope="module")
 def grasps() -> Grasps:
-    return synthetic.draw_grasps(CENTRE, 6, np.random.default_rng(0))[0]
+    return synthetic.draw_grasps(CENTER, 6, np.random.default_rng(0))[0]
 
 
 def test_mean_and_spread_are_those_of_the_members(members: list[str], view: Observation, grasps: Grasps) -> None:
     every = []
     for member in members:
         model = zoo.load(member)
-        logit = model.prepare(view).logit(grasps.waypoints)
+        logit = model.prepare(view).logit(grasps)
         every.append(logit / model.temperature + model.offset)
     ensemble = Ensemble(members=members).eval()
-    mean, spread = ensemble.prepare(view).logit_and_spread(grasps.waypoints)
+    mean, spread = ensemble.prepare(view).logit_and_spread(grasps)
     torch.testing.assert_close(mean, torch.stack(every).mean(0))
     torch.testing.assert_close(spread, torch.stack(every).std(0, correction=0))
-    torch.testing.assert_close(ensemble.score(view, grasps), mean.sigmoid())
+    torch.testing.assert_close(ensemble.score(grasps, view), mean.sigmoid())
 
 
 def test_spread_has_a_slope_even_where_members_agree(members: list[str], view: Observation, grasps: Grasps) -> None:
     for names, varies in (([members[0]] * 2, False), (members, True)):
-        waypoints = grasps.waypoints.clone().requires_grad_()
-        _, spread = Ensemble(members=names).eval().prepare(view).logit_and_spread(waypoints)
-        (slope,) = torch.autograd.grad(spread.sum(), waypoints, allow_unused=True)
-        assert torch.isfinite(slope).all()
-        assert bool(slope.any()) == varies
+        wrist, joints = grasps.wrist.clone().requires_grad_(), grasps.joints.clone().requires_grad_()
+        trajectory = replace(grasps.trajectory, wrist=wrist, joints=joints)
+        _, spread = Ensemble(members=names).eval().prepare(view).logit_and_spread(trajectory)
+        for slope in torch.autograd.grad(spread.sum(), (wrist, joints)):
+            assert torch.isfinite(slope).all()
+            assert bool(slope.any()) == varies
 
 
 def test_a_model_alone_has_no_spread(members: list[str], view: Observation, grasps: Grasps) -> None:
     prepared = zoo.load(members[0]).prepare(view)
-    logit, spread = prepared.logit_and_spread(grasps.waypoints)
-    torch.testing.assert_close(logit, prepared.logit(grasps.waypoints))
+    logit, spread = prepared.logit_and_spread(grasps)
+    torch.testing.assert_close(logit, prepared.logit(grasps))
     assert not spread.any()
 
 
@@ -77,12 +80,12 @@ def test_the_cost_is_that_of_all_members(
     members: list[str], view: Observation, grasps: Grasps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scores, "NUM_TIMED", 6)
-    image, waypoints = view.aimed().image()[None], grasps.waypoints
-    every = [scores.measure(zoo.load(member), image, waypoints) for member in members]
+    image, trajectory = view.aimed().image()[None], grasps.trajectory
+    every = [scores.measure(zoo.load(member), image, trajectory) for member in members]
     assert [one.megabytes for one in every] == [round(Path(member).stat().st_size / 1e6, 1) for member in members]
     pair = Ensemble(members=members[:2]).save(tmp_path)
     for ensemble in (Ensemble(members=members), Ensemble(members=[str(pair), members[2]])):
-        cost = scores.measure(ensemble.eval(), image, waypoints)
+        cost = scores.measure(ensemble.eval(), image, trajectory)
         assert cost.parameters == sum(one.parameters for one in every)
         assert cost.megabytes == pytest.approx(sum(one.megabytes for one in every), abs=0.2)  # each is rounded
 
@@ -96,14 +99,14 @@ def test_a_saved_ensemble_is_a_list_of_members(
     assert set(load_file(path)) == {"temperature", "offset"}
     again = zoo.load(tmp_path)
     assert again.arguments["members"] == members
-    torch.testing.assert_close(again.score(view, grasps), ensemble.score(view, grasps))
+    torch.testing.assert_close(again.score(grasps, view), ensemble.score(grasps, view))
 
 
 def test_fit_calibrates_it_on_validation_scenes(members: list[str], tmp_path: Path) -> None:
     folder, cache = str(synthetic.write(tmp_path / "grasps", num_grasps=40)), str(tmp_path / "cache")
     options = {"model.members": json.dumps(members[:2]), "data.folder": folder, "data.cache": cache}
     options |= {"trainer.logger.save_dir": str(tmp_path), "trainer.enable_progress_bar": "false"}
-    training.main(["fit", "--config", "ensemble.yaml", *(f"--{name}={value}" for name, value in options.items())])
+    main(["fit", "--config", "ensemble.yaml", *(f"--{name}={value}" for name, value in options.items())])
     made, card = zoo.load(tmp_path / "ensemble" / "version_0"), tmp_path / "ensemble" / "version_0" / "ensemble.json"
     assert json.loads(card.read_text())["grasps_seen"] == 0
     dataset = GraspDataModule(folder, cache=cache).dataset("validation", made)

@@ -11,9 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
-from dexzoo.cli import main
-from dexzoo.models.zoo import list_models, shipped_card
+import dexzoo
+from dexzoo.cli.main import main
+from dexzoo.grasp import Grasps
+from dexzoo.models.registry import list_models, shipped_card
+from dexzoo.perception import Observation
 from dexzoo.sim import Scene
 from dexzoo.sim.shapes import make_object
 
@@ -58,6 +62,21 @@ def test_the_commands_in_the_readme_run(desk: Path, monkeypatch: pytest.MonkeyPa
     assert (desk / "better.safetensors").exists()
 
 
+def test_a_term_of_your_own_is_climbed(can_view: Observation, can_grasps: Grasps) -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S)
+    names: dict[str, object] = {
+        "dexzoo": dexzoo,
+        "evaluator": dexzoo.load("em_fk"),
+        "grasps": can_grasps[:2],
+        "observation": can_view,
+    }
+    exec(block, names)
+    result = names["result"]
+    assert isinstance(result, dexzoo.Refinement)
+    assert (result.grasps.position[result.accepted, 6, 2] > 0).all()
+    torch.testing.assert_close(result.penalties["height"], result.grasps.position[:, 6, 2])
+
+
 def test_the_demo_ranks_verifies_and_draws(tmp_path: Path) -> None:
     call = [sys.executable, str(ROOT / "examples" / "01_demo.py"), "--num_grasps", "12", "--out", str(tmp_path)]
     done = subprocess.run(call, capture_output=True, text=True, check=True, timeout=120)
@@ -82,8 +101,8 @@ def test_the_cards_say_what_the_weights_and_the_benchmarks_do(monkeypatch: pytes
     cards = runpy.run_path(str(ROOT / "benchmarks" / "cards.py"))
     written = {path.stem: path.read_text() for path in (ROOT / "docs" / "cards").glob("*.md")}
     assert written == {name: cards["page"](name) for name in cards["shipped"]()}
-    for name, licence in (("hed", "MIT"), ("lite0", "Apache-2.0")):
-        assert f"| licence | {licence}, Copyright" in "\n".join(cards["trunk"]({"trunk": name}))
+    for name, license in (("hed", "MIT"), ("lite0", "Apache-2.0")):
+        assert f"| license | {license}, Copyright" in "\n".join(cards["trunk"]({"trunk": name}))
     assert "Frozen trunk" in written["em2"]
     assert "Frozen trunk" not in written["em_fk"]
 

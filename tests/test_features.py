@@ -6,16 +6,16 @@ import torch
 import trimesh
 
 from dexzoo import rotation
-from dexzoo.camera import Observation
-from dexzoo.generators.features import Features
+from dexzoo.perception.observation import Observation
+from dexzoo.perception.surface import SurfaceFeatures
 
 RADIUS = 0.04
 
 
-def of_mesh(mesh: trimesh.Trimesh) -> Features:
+def of_mesh(mesh: trimesh.Trimesh) -> SurfaceFeatures:
     points, faces = trimesh.sample.sample_surface(mesh, 20_000, seed=0)
     chosen = np.arange(len(points)) % 40 == 0
-    return Features.of_surface(np.array(points), mesh.face_normals[faces], chosen)
+    return SurfaceFeatures.of_surface(np.array(points), mesh.face_normals[faces], chosen)
 
 
 def test_a_sphere_is_curved_alike_everywhere() -> None:
@@ -52,17 +52,17 @@ def test_the_inside_of_a_pipe_is_concave_and_its_outside_left_alone() -> None:
 def test_frames_may_turn_by_half_a_turn_where_curvatures_differ_and_by_any_where_they_do_not() -> None:
     generator = torch.Generator().manual_seed(0)
     points, quaternion = torch.zeros(4000, 3), torch.tensor([1.0, 0, 0, 0]).repeat(4000, 1)
-    ridge = Features(points, quaternion, torch.tensor([25.0, 0.0]).repeat(4000, 1))
+    ridge = SurfaceFeatures(points, quaternion, torch.tensor([25.0, 0.0]).repeat(4000, 1))
     turned = rotation.rotate(ridge.ambiguous_turn(generator), torch.tensor([1.0, 0, 0]))
     assert turned[:, 0].abs().min() > 0.99
     assert (turned[:, 0] > 0).float().mean() == pytest.approx(0.5, abs=0.04)
-    ball = Features(points, quaternion, torch.tensor([25.0, 25.0]).repeat(4000, 1))
+    ball = SurfaceFeatures(points, quaternion, torch.tensor([25.0, 25.0]).repeat(4000, 1))
     turned = rotation.rotate(ball.ambiguous_turn(generator), torch.tensor([1.0, 0, 0]))
     assert turned[:, 0].abs().mean() == pytest.approx(2 / np.pi, abs=0.05), "as for an even distribution of directions"
 
 
 def test_a_view_gives_the_near_side_and_its_completion_the_far_one(can_view: Observation) -> None:
-    features = Features.of_view(can_view, 500, np.random.default_rng(0))
+    features = SurfaceFeatures.of_view(can_view, 500, np.random.default_rng(0))
     camera = torch.tensor(can_view.T_world_camera[:3, 3], dtype=torch.float32)
     assert ((features.normals * (camera - features.points)).sum(-1) > 0).all()
     whole = features.completed(can_view)
@@ -78,4 +78,4 @@ def test_too_few_points_are_refused(can_view: Observation) -> None:
     mask[rows[::400], columns[::400]] = True
     sparse = Observation(can_view.depth, can_view.camera, can_view.T_world_camera, mask=mask)
     with pytest.raises(ValueError, match="points besides noise, fewer than the 50"):
-        Features.of_view(sparse, 500, np.random.default_rng(0))
+        SurfaceFeatures.of_view(sparse, 500, np.random.default_rng(0))

@@ -15,10 +15,12 @@ import pytest
 import synthetic
 import torch
 
+from dexzoo.collection import rendering
 from dexzoo.data import grasp_set, writer
 from dexzoo.data.grasp_set import GraspSet, ViewImages
 from dexzoo.data.schema import SCHEMAS
 from dexzoo.data.writer import GraspSetWriter, SceneRows, scene_rows
+from dexzoo.hand import Hand
 
 CONFIGURATION = {"seed": 0}
 NUM_VIEWS, NUM_GRASPS = 2, 6
@@ -225,8 +227,8 @@ def test_a_full_disk_leaves_what_is_finished(tmp_path: Path) -> None:
 
 
 def test_rows_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="the table scenes has no column colour"):
-        make_rows(0, colour="red")
+    with pytest.raises(ValueError, match="the table scenes has no column color"):
+        make_rows(0, color="red")
     with pytest.raises(ValueError, match="scene 0 has the split 'holdout'; use one of train, validation, test"):
         make_rows(0, split="holdout")
 
@@ -245,13 +247,16 @@ def test_a_set_is_read_back(synthetic_set: Path) -> None:
     assert read.success.tolist() == read.grasps["success"].to_pylist()
     rng = np.random.default_rng(0)  # the first scene again, as synthetic.py draws it
     half = np.full(3, rng.uniform(0.03, 0.05))
-    centre = np.array([0, 0, half[2]])
-    poses = [synthetic.camera_pose(centre, rng) for _ in range(2)]
-    grasps, success = synthetic.draw_grasps(centre, 40, rng)
+    center = np.array([0, 0, half[2]])
+    poses = [synthetic.camera_pose(center, rng) for _ in range(2)]
+    grasps, success = synthetic.draw_grasps(center, 40, rng)
     assert read.success[:40].tolist() == success.tolist()
-    torch.testing.assert_close(read.world_grasps.waypoints[:40], grasps.waypoints, atol=1e-5, rtol=0)
+    assert read.hand == read.world_grasps.hand == Hand.load("dlr2")
+    torch.testing.assert_close(read.world_grasps.wrist[:40], grasps.wrist, atol=1e-5, rtol=0)
+    torch.testing.assert_close(read.world_grasps.joints[:40], grasps.joints, atol=1e-5, rtol=0)
+    assert torch.equal(read.world_grasps.grasp_type[:40], grasps.grasp_type)
     torch.testing.assert_close(read.camera_poses[1], torch.tensor(poses[1]).float())
-    np.testing.assert_array_equal(read.observation(1).mask, synthetic.render("ball", half, centre, poses[1]).mask)
+    np.testing.assert_array_equal(read.observation(1).mask, synthetic.render("ball", half, center, poses[1]).mask)
 
 
 def test_images_are_those_of_the_observations(synthetic_set: Path) -> None:
@@ -261,6 +266,21 @@ def test_images_are_those_of_the_observations(synthetic_set: Path) -> None:
     for place, view in enumerate((3, 0, 7)):
         expected = read.observation(view).image()
         torch.testing.assert_close(images[torch.tensor([place])][0], expected, atol=1e-6, rtol=0)
+
+
+def test_views_without_images_come_from_the_renderer(tmp_path: Path, synthetic_set: Path) -> None:
+    write(tmp_path / "set", [0, 1, 2], 3)
+    pngs = GraspSet(synthetic_set).depth([4, 5])
+    asked = []
+
+    def renderer(scene: dict[str, object], seeds: list[int], cache: Path) -> list[bytes]:
+        asked.append((scene["scene"], seeds, cache))
+        return pngs
+
+    read = GraspSet(tmp_path / "set", tmp_path / "cache", renderer)
+    assert read.depth([5, 0, 4]) == [pngs[1], pngs[0], pngs[0]]
+    # all views of a scene at once
+    assert asked == [(scene, [5, 5], tmp_path / "cache" / "renders") for scene in (0, 2)]
 
 
 def test_skipped_scenes_are_passed_over(tmp_path: Path) -> None:
@@ -423,14 +443,21 @@ def test_addresses_that_lead_nowhere_are_named(tmp_path: Path) -> None:
 
 def test_views_that_cannot_be_had_are_named(tmp_path: Path) -> None:
     write(tmp_path / "set", [0], 1)
-    read = GraspSet(tmp_path / "set", tmp_path / "cache")
+    with pytest.raises(ValueError, match="set keeps no images; open it with a renderer, see GraspSet"):
+        GraspSet(tmp_path / "set", tmp_path / "cache").observation(0)
     with pytest.raises(ValueError, match="scene 0 was not simulated, so it cannot be made again"):
-        read.observation(0)
+        GraspSet(tmp_path / "set", tmp_path / "cache", rendering.render).observation(0)
+
+
+def test_a_set_of_an_unknown_hand_is_refused(folder: Path) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["configuration"]["hand"] = "shadow"
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(ValueError, match=r"set is of a hand 'shadow', which is not in robots/"):
+        GraspSet(folder)
 
 
 def test_rendered_views_are_cached_and_made_again_when_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from dexzoo.data import rendering
-
     made = []
     rebuild = rendering.rebuild
     monkeypatch.setattr(rendering, "rebuild", lambda row: made.append(row["scene"]) or rebuild(row))

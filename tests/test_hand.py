@@ -15,9 +15,9 @@ import yourdfpy
 from torch.autograd import gradcheck
 
 from dexzoo import rotation
-from dexzoo.grasp import pose_matrix
 from dexzoo.hand import Hand, HandSpec, Primitive
 from dexzoo.resources import resource
+from dexzoo.rotation import pose_matrix
 
 URDF = resource("robots") / "dlr2" / "dlr2.urdf"
 GOLDEN = json.loads((Path(__file__).parent / "golden" / "dlr2_fingertips.json").read_text())
@@ -82,9 +82,13 @@ def poses_of_mujoco(hand: Hand, q20: torch.Tensor) -> np.ndarray:
 def poses_of_pytorch_kinematics(hand: Hand, q20: torch.Tensor) -> np.ndarray:
     text = URDF.read_text().split("?>", 1)[1]
     chain = pytorch_kinematics.build_chain_from_urdf(text).to(dtype=torch.float64)
+    return poses_of_chain(chain, hand, q20).numpy()
+
+
+def poses_of_chain(chain: pytorch_kinematics.Chain, hand: Hand, q20: torch.Tensor) -> torch.Tensor:
     order = [hand.joint_names.index(name) for name in chain.get_joint_parameter_names()]
     poses = chain.forward_kinematics(q20[:, order])
-    return torch.stack([poses[link].get_matrix().expand(len(q20), 4, 4) for link in hand.link_names], 1).numpy()
+    return torch.stack([poses[link].get_matrix().expand(len(q20), 4, 4) for link in hand.link_names], 1)
 
 
 @pytest.mark.parametrize("reference", [poses_of_yourdfpy, poses_of_mujoco, poses_of_pytorch_kinematics])
@@ -94,6 +98,14 @@ def test_kinematics_agree_with_others(hand: Hand, reference: Callable[[Hand, tor
     # rotations are held to the same figure, on links of at most 0.1 m
     np.testing.assert_allclose(hand.forward_kinematics(q20), theirs, atol=1e-6, rtol=0)
     np.testing.assert_allclose(hand.forward_kinematics(q20.float()), theirs, atol=1e-6, rtol=0)
+
+
+def test_kinematics_are_those_of_the_chain(hand: Hand, left: Hand) -> None:
+    for side in (hand, left):
+        q20 = postures(side, 200, seed=8)
+        theirs = poses_of_chain(side.chain, side, q20)
+        assert theirs.dtype == torch.float64
+        torch.testing.assert_close(side.forward_kinematics(q20), theirs, atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize("posture", GOLDEN["postures"], ids=lambda posture: posture["name"])
@@ -397,6 +409,27 @@ def test_a_hand_loads_from_a_folder(folder: Path, hand: Hand) -> None:
     other = Hand.load(folder)
     assert other.link_names == hand.link_names
     assert other.spec.name == "copy"
+
+
+def test_equal_hands_have_equal_digests(folder: Path, hand: Hand, left: Hand) -> None:
+    renamed = folder.rename(folder.with_name("another_name"))
+    for side in (hand, left):
+        for same in (Hand.load("dlr2", side.spec.side), Hand.load(renamed, side.spec.side)):
+            assert same.digest == side.digest
+            assert same == side
+            assert hash(same) == hash(side)
+    assert left.digest != hand.digest
+    assert left != hand
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [("hand.yaml", "radius: 0.011", "radius: 0.012"), ("dlr2.urdf", '<mass value="', '<mass value="1')],
+)
+def test_a_changed_hand_has_another_digest(folder: Path, hand: Hand, file: str, old: str, new: str) -> None:
+    rewrite(folder / file, old, new)
+    assert Hand.load(folder).digest != hand.digest
+    assert Hand.load(folder) != hand
 
 
 def test_a_folder_of_the_same_name_does_not_hide_a_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

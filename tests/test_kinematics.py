@@ -10,9 +10,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
-from dexzoo.camera import Camera, Observation
 from dexzoo.hand import Hand, HandSpec, Joint
-from dexzoo.kinematics import KinematicTree, LinkPoses
+from dexzoo.hand.kinematics import KinematicTree, LinkPoses, build_chain
+from dexzoo.perception.camera import Camera
+from dexzoo.perception.observation import Observation
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
@@ -81,7 +82,7 @@ def postures(hand: Hand, num: int, seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize(("seed", "num_links"), [(0, 2), (1, 7), (2, 15), (3, 30)])
 def test_any_tree_agrees_with_plain_products(seed: int, num_links: int) -> None:
     spec = random_tree(seed, num_links)
-    tree = KinematicTree(spec, torch.float64, torch.device("cpu"))
+    tree = KinematicTree(build_chain(spec), spec.link_names, spec.joint_names, torch.float64, torch.device("cpu"))
     generator = torch.Generator().manual_seed(seed)
     q = torch.randn(5, len(spec.joint_names), generator=generator, dtype=torch.float64).requires_grad_()
     ours, theirs = LinkPoses.apply(q, tree), plain_kinematics(spec, q)

@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from dexzoo.camera import Camera, Observation, look_at
-from dexzoo.generators import list_generators, make_generator
-from dexzoo.generators.demonstration import SHIPPED, load_demonstrations
-from dexzoo.generators.density import Grips
-from dexzoo.generators.kopicki import KopickiGenerator, Way
-from dexzoo.generators.search import anneal, climb
-from dexzoo.generators.surroundings import beyond, obstacles, underneath
+from dexzoo.generators import GENERATORS, make_generator
+from dexzoo.generators.approach import ApproachMotion
+from dexzoo.generators.contact_density import Grips
+from dexzoo.generators.demonstration import load_demonstrations, shipped_demonstrations
+from dexzoo.generators.kopicki import KopickiGenerator
+from dexzoo.generators.search import anneal, ascend
 from dexzoo.grasp import GRIP, Grasps
 from dexzoo.hand import Hand
+from dexzoo.perception import Camera, Observation, View
+from dexzoo.perception.camera import look_at
+from dexzoo.perception.surroundings import beyond, obstacles, underneath
 from dexzoo.sim import Scene
 from dexzoo.sim.shapes import make_object
 
@@ -22,8 +24,8 @@ CALL = {"num_samples": 600, "num_kernels": 4000, "num_steps": (5, 10)}
 
 
 @pytest.fixture(scope="module")
-def generator() -> KopickiGenerator:
-    shown = [one for one in load_demonstrations() if one.object in ("shaker_13", "box_09")]
+def generator(hand: Hand) -> KopickiGenerator:
+    shown = [one for one in load_demonstrations(hand) if one.object in ("shaker_13", "box_09")]
     return KopickiGenerator(shown, num_per_type=4, **CALL)  # type: ignore[arg-type]
 
 
@@ -33,7 +35,7 @@ def grasps(generator: KopickiGenerator, can_view: Observation) -> Grasps:
 
 
 def test_the_likeliest_come_first_and_no_type_takes_all(grasps: Grasps, generator: KopickiGenerator) -> None:
-    assert grasps.frame == "camera"
+    assert grasps.hand is generator.hand
     assert grasps.log_likelihood is not None
     assert (grasps.log_likelihood.diff() <= 0).all()
     types, count = grasps.grasp_type.unique(return_counts=True)
@@ -42,16 +44,15 @@ def test_the_likeliest_come_first_and_no_type_takes_all(grasps: Grasps, generato
     assert len(types) >= 3
 
 
-def test_grasps_keep_the_limits_and_clear_the_table(grasps: Grasps, can_view: Observation, hand: Hand) -> None:
+def test_grasps_keep_the_limits_and_clear_the_table(grasps: Grasps, hand: Hand) -> None:
     hand.check(grasps.joints)
-    world = grasps.to_frame("world", can_view.T_world_camera)
-    way = world.wrist_pose[:, : GRIP + 1, None] @ hand.forward_kinematics(world.joints[:, : GRIP + 1])
-    assert hand.clearance(way, torch.tensor([0.0, 0, 1, 0])).min() > 0
+    links = grasps.wrist_pose[:, : GRIP + 1, None] @ hand.forward_kinematics(grasps.joints[:, : GRIP + 1])
+    assert hand.clearance(links, torch.tensor([0.0, 0, 1, 0])).min() > 0
 
 
 def test_the_hand_comes_to_the_object(grasps: Grasps, can_view: Observation, hand: Hand) -> None:
     links = grasps.wrist_pose[:, GRIP, None] @ hand.forward_kinematics(grasps.joints[:, GRIP])
-    points = torch.from_numpy(can_view.points[::20])
+    points = torch.from_numpy(can_view.points_world[::20])
     nearest = hand.signed_distance(links, points).amin((-1, -2))
     assert nearest.median() < 0.005
     assert nearest.max() < 0.05, "what touches the hidden side is not far from the seen one"
@@ -60,10 +61,16 @@ def test_the_hand_comes_to_the_object(grasps: Grasps, can_view: Observation, han
 def test_the_same_seed_gives_the_same_grasps(
     grasps: Grasps, generator: KopickiGenerator, can_view: Observation
 ) -> None:
-    again = generator.generate(can_view, 20, seed=0)
-    assert torch.equal(again.waypoints, grasps.waypoints)
+    view = View(can_view)
+    again = generator.generate(view, 20, seed=0)
+    assert torch.equal(again.wrist, grasps.wrist)
+    assert torch.equal(again.joints, grasps.joints)
+    assert torch.equal(again.grasp_type, grasps.grasp_type)
     other = generator.generate(can_view, 20, seed=1)
-    assert not torch.equal(other.waypoints[: len(grasps)], grasps.waypoints[: len(other)])
+    assert not torch.equal(other.wrist[: len(grasps)], grasps.wrist[: len(other)])
+    density = generator.density(view, seed=0)
+    assert generator.density(view, seed=0) is density, "made once for each view and seed"
+    assert generator.density(view, seed=1) is not density
 
 
 def test_annealing_and_gradient_both_raise_the_likelihood(generator: KopickiGenerator, can_view: Observation) -> None:
@@ -75,7 +82,7 @@ def test_annealing_and_gradient_both_raise_the_likelihood(generator: KopickiGene
 
     before = density.log_likelihood(grips).mean()
     annealed = anneal(density, grips, free, 60, torch.Generator().manual_seed(1))
-    climbed = climb(density, grips, free, 30)
+    climbed = ascend(density, grips, free, 30)
     assert density.log_likelihood(annealed).mean() > before + 1
     assert density.log_likelihood(climbed).mean() > density.log_likelihood(annealed).mean(), "at half the steps"
 
@@ -84,40 +91,46 @@ def test_the_likelihood_of_what_was_generated_is_that_of_the_density_less_costs(
     grasps: Grasps, generator: KopickiGenerator, can_view: Observation
 ) -> None:
     density = generator.density(can_view, seed=0)
-    value = density.log_density(grasps.to_frame("world", can_view.T_world_camera))
+    value = density.log_density(grasps)
     assert grasps.log_likelihood is not None
     assert (value >= grasps.log_likelihood - 0.5).all()
 
 
 def test_fingers_that_stop_short_of_the_surface_or_in_it_cost_the_thumb_most(hand: Hand) -> None:
     """The demonstrated grip on the demonstrated surface, moved off it by what the cost should then tell."""
-    shown = [one for one in load_demonstrations() if one.object == "can_00"]
+    shown = [one for one in load_demonstrations(hand) if one.object == "can_00"]
     generator = KopickiGenerator(shown, **CALL)  # type: ignore[arg-type]
     for demo, one in enumerate(shown):
-        way = Way(shown, generator.models, hand, one.surface.points, torch.zeros(0, 3), torch.Generator())
+        motion = ApproachMotion(shown, generator.models, hand, one.surface.points, torch.zeros(0, 3), torch.Generator())
         wrist, joints = one.grasp.wrist_pose[:, GRIP], hand.reduce(one.grasp.joints[:, GRIP])
         at = torch.tensor([demo])
-        assert way.gap_cost(Grips(at, wrist, joints)) < 1.5, "the fingers touch, but for the spacing of the points"
+        assert motion.gap_cost(Grips(at, wrist, joints)) < 1.5, "the fingers touch, but for the spacing of the points"
         opened = {}
         for finger in ("thumb", "index"):
             posture = joints.clone()
             posture[:, hand.freedoms.index(f"{finger}_mcp")] -= 0.3
-            opened[finger] = float(way.gap_cost(Grips(at, wrist, posture)))
+            opened[finger] = float(motion.gap_cost(Grips(at, wrist, posture)))
         assert opened["thumb"] > 1.5 * opened["index"] > 1.5
         away = wrist.clone()
         away[:, 2, 3] += 0.3
-        assert way.gap_cost(Grips(at, away, joints)) > 100
+        assert motion.gap_cost(Grips(at, away, joints)) > 100
 
 
-def test_generators_by_name_and_by_folder() -> None:
-    assert list_generators()[0] == "kopicki"
-    assert make_generator("kopicki") is make_generator("kopicki"), "made once"
-    named, folder = make_generator("kopicki"), make_generator(str(SHIPPED))
+def test_generators_by_name_and_by_folder(hand: Hand) -> None:
+    assert GENERATORS[0] == "kopicki"
+    assert make_generator("kopicki", hand) is make_generator("kopicki", Hand.load()), "made once for equal hands"
+    assert all(make_generator(name, hand).hand == hand for name in GENERATORS)
+    named, folder = make_generator("kopicki", hand), make_generator(str(shipped_demonstrations(hand)), hand)
     assert isinstance(named, KopickiGenerator)
     assert isinstance(folder, KopickiGenerator)
     assert [d.grasp_type for d in folder.demonstrations] == [d.grasp_type for d in named.demonstrations]
     with pytest.raises(ValueError, match="generator 'magic' is unknown; use one of kopicki, heuristic, or a folder"):
-        make_generator("magic")
+        make_generator("magic", hand)
+
+
+def test_demonstrations_of_another_hand_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"the hand dlr2 \(right\), not of dlr2 \(left\)"):
+        make_generator("kopicki", Hand.load(side="left"))
 
 
 def test_the_support_of_an_object_is_an_obstacle() -> None:
@@ -172,13 +185,13 @@ def test_the_cost_by_the_nearest_points_is_that_by_all(generator: KopickiGenerat
     view = scene.observe(seed=1)
     density = generator.density(view)
     others = obstacles(view)
-    way = Way(
+    motion = ApproachMotion(
         generator.demonstrations, generator.models, generator.hand, density.surface.points, others, torch.Generator()
     )
     grips = density.sample(60, torch.Generator().manual_seed(0))
-    full = way.table_cost(grips)
-    assert (full > way.table_cost(grips, others[:0])).any(), "some grips touch the block and not the table"
-    torch.testing.assert_close(way.table_cost_near(grips)(grips), full)
+    full = motion.table_cost(grips)
+    assert (full > motion.table_cost(grips, others[:0])).any(), "some grips touch the block and not the table"
+    torch.testing.assert_close(motion.table_cost_near(grips)(grips), full)
 
 
 def test_what_cannot_be_grasped_is_said(generator: KopickiGenerator, can_view: Observation) -> None:

@@ -15,6 +15,7 @@ from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.grasp_set import GraspSet
 from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.grasp import Grasps
+from dexzoo.hand import Hand
 from dexzoo.models.em2 import EM2
 from dexzoo.sim.shapes import make_object
 
@@ -49,10 +50,11 @@ def folder(tmp_path: Path) -> Path:
 def test_objects_are_tried_recorded_compared_and_reported(
     meshes: Any,  # noqa: ANN401
     folder: Path,
+    hand: Hand,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    generator = HeuristicGenerator(num_samples=800)  # the default one takes seconds for a view
+    generator = HeuristicGenerator(hand, num_samples=800)  # the default one takes seconds for a view
     seen = []
 
     def generate(view: Observation, num_grasps: int, seed: int) -> Grasps:

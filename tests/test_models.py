@@ -4,9 +4,11 @@ import pickle
 import runpy
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import synthetic
 import torch
@@ -17,16 +19,18 @@ from lightning.pytorch.plugins.precision import MixedPrecision
 from safetensors.torch import load_file
 from sklearn.preprocessing import StandardScaler
 
-from dexzoo import training
-from dexzoo.camera import Observation
+from dexzoo.comparison.scores import one_view
 from dexzoo.data.datamodule import GraspDataModule
-from dexzoo.grasp import POSITION, QUATERNION, Grasps
-from dexzoo.models import encoders, evaluator, trunks, zoo
+from dexzoo.grasp import Grasps, Trajectory
+from dexzoo.hand import Hand
+from dexzoo.models import encoders, evaluator, registry, trunks, zoo
 from dexzoo.models.em1 import EM1
 from dexzoo.models.em2 import EM2
 from dexzoo.models.em_fk import EMFK
 from dexzoo.models.evaluator import GraspEvaluator
+from dexzoo.perception import Observation, View
 from dexzoo.resources import resource
+from dexzoo.training.command_line import CommandLine, main
 
 SMOKE = ["--config=smoke.yaml", "--trainer.max_steps=3", "--trainer.val_check_interval=3", "--model.width=64", "--json"]
 
@@ -61,7 +65,7 @@ YOURS: type[GraspEvaluator] = runpy.run_path(str(EXAMPLE), run_name="example")["
 """The example's architecture is no part of the zoo and keeps the same contract."""
 
 
-@pytest.fixture(scope="module", params=[*zoo.list_models(), YOURS.architecture])
+@pytest.fixture(scope="module", params=[*registry.list_models(), YOURS.architecture])
 def model(request: pytest.FixtureRequest, data: GraspDataModule) -> GraspEvaluator:
     torch.manual_seed(0)
     made = zoo.model_class(request.param)()
@@ -90,16 +94,16 @@ def test_a_model_is_registered_under_its_own_name(model: GraspEvaluator) -> None
 
 def test_shapes(model: GraspEvaluator, data: GraspDataModule) -> None:
     images = torch.stack([data.source.observation(view).image() for view in range(2)])
-    scene = model.encode(images)
-    assert all(len(value) == 2 for value in scene.values())
-    assert model.logit(scene, data.waypoints[:6].reshape(2, 3, 10, 28)).shape == (2, 3)
+    encoding = model.encode(images)
+    assert all(len(value) == 2 for value in encoding.values())
+    assert model.logit(encoding, Trajectory.stack(data.aimed_grasps[:6].split(3))).shape == (2, 3)
 
 
 def test_views_and_grasps_do_not_mix(model: GraspEvaluator, data: GraspDataModule) -> None:
-    scene = model.encode(torch.stack([data.source.observation(view).image() for view in (0, 3)]))
-    waypoints = data.waypoints[:6].reshape(2, 3, 10, 28)
-    whole = model.logit(scene, waypoints)
-    one = model.logit({name: value[1:] for name, value in scene.items()}, waypoints[1:, 2:])
+    encoding = model.encode(torch.stack([data.source.observation(view).image() for view in (0, 3)]))
+    grasps = data.aimed_grasps[:6]
+    whole = model.logit(encoding, Trajectory.stack(grasps.split(3)))
+    one = model.logit({name: value[1:] for name, value in encoding.items()}, one_view(grasps[5]))
     torch.testing.assert_close(whole[1, 2], one[0, 0], atol=1e-4, rtol=1e-4)
 
 
@@ -109,53 +113,74 @@ def test_a_batch_is_its_grasps_one_by_one(
     model: GraspEvaluator, data: GraspDataModule, paired: list[int], encoded: bool
 ) -> None:
     images = torch.stack([data.source.observation(view).image() for view in range(max(paired) + 1)])
-    view, grasps = torch.tensor(paired), data.waypoints[: len(paired), None]
+    view, grasps = torch.tensor(paired), data.aimed_grasps[: len(paired)]
     with torch.no_grad():
-        scene = model.encode(images)
-        batch = evaluator.Batch(scene if encoded else images, view, grasps, torch.zeros(len(view)), view)
+        encoding = model.encode(images)
+        batch = evaluator.Batch(encoding if encoded else images, view, grasps, torch.zeros(len(view)), view)
         alone = [
-            model.logit({name: value[v, None] for name, value in scene.items()}, grasp[None]).item()
-            for v, grasp in zip(paired, grasps, strict=True)
+            model.logit({name: value[v, None] for name, value in encoding.items()}, one_view(grasp)).item()
+            for v, grasp in zip(paired, grasps.split(1), strict=True)
         ]
         found = model.batch_logit(batch)
     torch.testing.assert_close(found, torch.tensor(alone), atol=1e-4, rtol=1e-4)
 
 
 def test_logits_follow_every_part_of_a_grasp(model: GraspEvaluator, data: GraspDataModule) -> None:
-    scene = model.encode(data.source.observation(0).image()[None])
-    waypoints = data.waypoints[None, :3].clone().requires_grad_()
-    (slope,) = torch.autograd.grad(model.logit(scene, waypoints).sum(), waypoints)
-    for part in (POSITION, QUATERNION, slice(7, 27)):
-        assert (slope[..., part].abs().sum((-1, -2)) > 0).all()
+    encoding = model.encode(data.source.observation(0).image()[None])
+    grasps = one_view(data.aimed_grasps[:3])
+    parts = (grasps.wrist.requires_grad_(), grasps.joints.requires_grad_())
+    wrist, joints = torch.autograd.grad(model.logit(encoding, grasps).sum(), parts)
+    for slope in (wrist[..., :3], wrist[..., 3:], joints):
+        assert (slope.abs().sum((-1, -2)) > 0).all()
 
 
 def test_slopes_agree_with_finite_differences(model: GraspEvaluator, data: GraspDataModule) -> None:
     exact = zoo.model_class(model.architecture)(**model.arguments).double().eval()
     exact.load_state_dict(model.state_dict())
-    scene = {name: value.double() for name, value in model.encode(data.source.observation(0).image()[None]).items()}
-    waypoints = data.waypoints[None, :2].double().requires_grad_()
-    (slope,) = torch.autograd.grad(exact.logit(scene, waypoints).sum(), waypoints)
+    encoding = {name: value.double() for name, value in model.encode(data.source.observation(0).image()[None]).items()}
+    grasps = one_view(data.aimed_grasps[:2]).to(torch.float64)
+    parts = (grasps.wrist.requires_grad_(), grasps.joints.requires_grad_())
+    slopes = torch.autograd.grad(exact.logit(encoding, grasps).sum(), parts)
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
-        way = torch.randn(waypoints.shape, generator=generator, dtype=torch.float64)
-        way[..., 27] = 0  # the type is a choice, not a number
-        step = 1e-8 * way  # short: a ReLU may lie nearer than that to its kink
+        ways = [torch.randn(part.shape, generator=generator, dtype=torch.float64) for part in parts]
+
+        def moved(step: float, ways: list[torch.Tensor] = ways) -> torch.Tensor:
+            wrist, joints = (part + step * way for part, way in zip(parts, ways, strict=True))
+            return exact.logit(encoding, Trajectory(wrist, joints, grasps.grasp_type)).sum()
+
         with torch.no_grad():
-            rise = (exact.logit(scene, waypoints + step) - exact.logit(scene, waypoints - step)).sum() / 2e-8
-        assert float(rise) == pytest.approx(float((slope * way).sum()), rel=0.02, abs=2e-6)
+            rise = (moved(1e-8) - moved(-1e-8)) / 2e-8  # short: a ReLU may lie nearer than that to its kink
+        expected = sum((slope * way).sum() for slope, way in zip(slopes, ways, strict=True))
+        assert float(rise) == pytest.approx(float(expected), rel=0.02, abs=2e-6)
 
 
-def test_scores_are_probabilities_and_the_same_in_either_frame(
+def test_scores_are_probabilities_of_grasps_in_the_world_frame(
     model: GraspEvaluator, observation: Observation, grasps: Grasps
 ) -> None:
-    p = model.score(observation, grasps)
+    p = model.score(grasps, observation)
     assert p.shape == (12,)
     assert ((p > 0) & (p < 1)).all()
-    in_camera = grasps.to_frame("camera", observation.T_world_camera)
-    torch.testing.assert_close(model.score(observation, in_camera), p, atol=1e-4, rtol=0)
-    logits = model.prepare(observation).logit(grasps.waypoints)
+    aimed = observation.aimed()
+    in_camera = grasps.trajectory.transformed(np.linalg.inv(aimed.T_world_camera))
+    with torch.no_grad():
+        logits = model.logit(model.encode(aimed.image()[None]), one_view(in_camera))[0]
+    torch.testing.assert_close(logits.sigmoid(), p, atol=1e-4, rtol=0)
+    logits = model.prepare(observation).logit(grasps)
     torch.testing.assert_close(logits.sigmoid(), p, atol=1e-5, rtol=0)
-    assert model.score(observation, grasps[:0]).shape == (0,)
+    torch.testing.assert_close(model.score(observation, grasps), p)
+    assert model.score(grasps[:0], observation).shape == (0,)
+
+
+def test_a_hand_that_the_model_does_not_know_is_refused(
+    model: GraspEvaluator, observation: Observation, grasps: Grasps
+) -> None:
+    left = Grasps.of(grasps.trajectory, Hand.load("dlr2", side="left"))
+    message = rf"^evaluator {model.architecture} knows the hand dlr2 \(right\), not dlr2 \(left\)$"
+    with pytest.raises(ValueError, match=message):
+        model.score(left, observation)
+    with pytest.raises(ValueError, match=message):
+        model.score(left[:0], observation)
 
 
 def test_the_image_is_encoded_once(
@@ -163,23 +188,24 @@ def test_the_image_is_encoded_once(
 ) -> None:
     calls = []
     encode = model.encode
-    whole = model.score(observation, grasps)
+    whole = model.score(grasps, observation)
     monkeypatch.setattr(model, "encode", lambda images: calls.append(tuple(images.shape)) or encode(images))
     monkeypatch.setattr(evaluator, "CHUNK", 5)
-    torch.testing.assert_close(model.score(observation, grasps), whole, atol=1e-5, rtol=0)
-    assert calls == [(1, 2, 224, 224)]
+    view = View(observation)
+    for _ in range(2):
+        torch.testing.assert_close(model.score(grasps, view), whole, atol=1e-5, rtol=0)
+        assert calls == [(1, 2, 224, 224)]
 
 
 def test_scoring_drops_nothing_and_leaves_the_mode(
     model: GraspEvaluator, observation: Observation, grasps: Grasps
 ) -> None:
-    quiet = model.score(observation, grasps)
+    quiet = model.score(grasps, observation)
     model.train()
     *_, still = model.modules()
     still.eval()
-    torch.testing.assert_close(model.score(observation, grasps), quiet)
-    world = grasps.to_frame("world", observation.T_world_camera).waypoints
-    torch.testing.assert_close(model.probability(model.prepare(observation).logit(world)), quiet, atol=1e-5, rtol=0)
+    torch.testing.assert_close(model.score(grasps, observation), quiet)
+    torch.testing.assert_close(model.probability(model.prepare(observation).logit(grasps)), quiet, atol=1e-5, rtol=0)
     assert model.training
     assert not still.training
     model.eval()
@@ -188,15 +214,15 @@ def test_scoring_drops_nothing_and_leaves_the_mode(
 def test_saving_and_loading_keep_the_scores(
     model: GraspEvaluator, observation: Observation, grasps: Grasps, tmp_path: Path
 ) -> None:
-    before = model.score(observation, grasps)
+    before = model.score(grasps, observation)
     path = model.save(tmp_path, half=False, card={"seed": 3})
     assert path.name == f"{model.architecture}.safetensors"
     again = zoo.load(tmp_path)
     assert type(again) is type(model)
     assert not again.training
-    torch.testing.assert_close(again.score(observation, grasps), before, atol=1e-6, rtol=0)
+    torch.testing.assert_close(again.score(grasps, observation), before, atol=1e-6, rtol=0)
     model.save(tmp_path)
-    torch.testing.assert_close(zoo.load(path).score(observation, grasps), before, atol=5e-3, rtol=0)
+    torch.testing.assert_close(zoo.load(path).score(grasps, observation), before, atol=5e-3, rtol=0)
     card = json.loads(path.with_suffix(".json").read_text())
     assert card["arguments"] == model.arguments
     assert not any("trunk" in name for name in load_file(path))
@@ -211,20 +237,30 @@ def test_a_world_laid_out_otherwise_changes_nothing(
     moved = Observation(
         observation.depth, observation.camera, motion.numpy() @ observation.T_world_camera, mask=observation.mask
     )
-    expected = model.score(observation, grasps)
-    torch.testing.assert_close(model.score(moved, grasps.moved(motion)), expected, atol=1e-3, rtol=0)
+    expected = model.score(grasps, observation)
+    torch.testing.assert_close(model.score(grasps.transformed(motion), moved), expected, atol=1e-3, rtol=0)
 
 
 def test_a_half_turn_of_sign_in_a_quaternion_changes_nothing(model: GraspEvaluator, data: GraspDataModule) -> None:
-    scene = model.encode(data.source.observation(0).image()[None])
-    waypoints = data.waypoints[None, :4]
-    flipped = waypoints.clone()
-    flipped[..., QUATERNION] *= -1
-    torch.testing.assert_close(model.logit(scene, flipped), model.logit(scene, waypoints))
+    encoding = model.encode(data.source.observation(0).image()[None])
+    grasps = one_view(data.aimed_grasps[:4])
+    flipped = replace(grasps, wrist=torch.cat((grasps.position, -grasps.quaternion), -1))
+    torch.testing.assert_close(model.logit(encoding, flipped), model.logit(encoding, grasps))
+
+
+def test_what_a_model_is_asked_wrongly_gets_one_line(observation: Observation, grasps: Grasps) -> None:
+    assert EM2(width=8).hands == ["dlr2"]
+    with pytest.raises(ValueError, match=r"^hands is empty; name at least one hand of robots/$"):
+        EM2(width=8, hands=[])
+    with pytest.raises(FileNotFoundError, match="two_thumbs"):
+        EM2(width=8, hands=["two_thumbs"])
+    for pair in ((grasps, grasps), (observation, View(observation))):
+        with pytest.raises(ValueError, match=r"^score takes grasps and an observation$"):
+            EM2(width=8).score(*pair)
 
 
 def test_your_own_architecture_needs_no_more_than_a_subclass(tmp_path: Path) -> None:
-    assert YOURS.architecture not in zoo.list_models()
+    assert YOURS.architecture not in registry.list_models()
     path = YOURS(width=8).save(tmp_path)
     assert isinstance(zoo.load(path), YOURS)
     change_card(path, architecture="three_branches")
@@ -255,32 +291,33 @@ def test_em2_has_the_thesis_sizes(width: int, total: int) -> None:
 
 
 def test_280_numbers_are_one_hot_type_then_ten_times_27(data: GraspDataModule) -> None:
-    waypoints = data.waypoints[:5]
-    vector = encoders.GraspVector.flatten(waypoints)
+    grasps = data.aimed_grasps[:5]
+    vector = encoders.GraspVector.flatten(grasps)
     assert vector.shape == (5, 280)
-    assert torch.equal(vector[:, :10].argmax(1), waypoints[:, 0, 27].long())
+    assert torch.equal(vector[:, :10].argmax(1), grasps.grasp_type)
     assert torch.equal(vector[:, :10].sum(1), torch.ones(5))
-    torch.testing.assert_close(vector[:, 10:].reshape(5, 10, 27), waypoints[..., :27])
+    torch.testing.assert_close(vector[:, 10:].reshape(5, 10, 27), torch.cat((grasps.wrist, grasps.joints), -1))
 
 
-def test_inputs_are_standardised_and_constant_ones_survive(data: GraspDataModule) -> None:
+def test_inputs_are_standardized_and_constant_ones_survive(data: GraspDataModule) -> None:
     layer = encoders.GraspVector()
-    waypoints = data.waypoints.clone()
-    waypoints[..., 0] = 0.3
-    layer.fit_statistics(waypoints)
-    vector = layer(waypoints)
+    wrist = data.aimed_grasps.wrist.clone()
+    wrist[..., 0] = 0.3
+    grasps = replace(data.aimed_grasps, wrist=wrist)
+    layer.fit_statistics(grasps)
+    vector = layer(grasps)
     varied = vector.std(0) > 0.5
     torch.testing.assert_close(vector.mean(0), torch.zeros(280), atol=1e-4, rtol=0)
     torch.testing.assert_close(vector[:, varied].std(0), torch.ones(int(varied.sum())), atol=1e-3, rtol=0)
     assert (vector[:, 10].abs() < 1e-5).all()
 
 
-def test_features_of_a_trunk_are_standardised_over_training_views(data: GraspDataModule) -> None:
+def test_features_of_a_trunk_are_standardized_over_training_views(data: GraspDataModule) -> None:
     torch.manual_seed(0)
     images = data.source.images(range(4))[torch.arange(4)]
-    model = EM2(width=16, standardise=True).eval()
-    model.fit_statistics(images, data.waypoints)
-    features, grasps = model.encode(images)["features"], data.waypoints[:4, None]
+    model = EM2(width=16, standardize=True).eval()
+    model.fit_statistics(images, data.aimed_grasps)
+    features, grasps = model.encode(images)["features"], Trajectory.stack(data.aimed_grasps[:4].split(1))
     shown = features.clone()
     shown[0] += 10  # far outside what was seen in training
     plain = EM2(width=16).eval()
@@ -325,7 +362,7 @@ def arguments(data: GraspDataModule) -> list[str]:
 @pytest.mark.parametrize("config", sorted(path.name for path in resource("configs").glob("*.yaml")))
 @pytest.mark.usefixtures("here")
 def test_every_configuration_runs(config: str, arguments: list[str]) -> None:
-    training.main(["fit", "--config", config, *arguments, "--trainer.fast_dev_run", "1"])
+    main(["fit", "--config", config, *arguments, "--trainer.fast_dev_run", "1"])
 
 
 @pytest.mark.parametrize("name", ["em1", "em2"])
@@ -341,7 +378,7 @@ def test_the_recipe_of_the_thesis_is_kept(name: str) -> None:
 def test_fit_writes_a_run_that_load_and_the_other_commands_take(
     here: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    training.main(["fit", *SMOKE, *arguments, "--seed", "5"])
+    main(["fit", *SMOKE, *arguments, "--seed", "5"])
     result = json.loads(capsys.readouterr().out)
     weights = Path(result["weights"])
     assert weights == Path("runs/smoke/version_0/em2.safetensors")
@@ -368,16 +405,16 @@ def test_fit_writes_a_run_that_load_and_the_other_commands_take(
 
     figures = []
     for path in (weights.parent / "checkpoints" / "best.ckpt", weights.parent):
-        training.main(["test", *SMOKE, *arguments, "--ckpt_path", str(path)])
+        main(["test", *SMOKE, *arguments, "--ckpt_path", str(path)])
         figures.append(json.loads(capsys.readouterr().out)["test_loss"])
     assert figures[0] == pytest.approx(figures[1], abs=1e-2)
-    training.main(["predict", *SMOKE, *arguments, "--ckpt_path", str(weights)])
+    main(["predict", *SMOKE, *arguments, "--ckpt_path", str(weights)])
     predicted = json.loads(Path(json.loads(capsys.readouterr().out)["predictions"]).read_text())
     assert len(predicted["probability"]) == 40
 
     # resuming goes on from the step it stopped at
     resume = ["fit", *SMOKE, *arguments, "--ckpt_path", str(weights.parent / "checkpoints" / "best.ckpt")]
-    training.main([*resume, "--trainer.max_steps", "5"])
+    main([*resume, "--trainer.max_steps", "5"])
     assert Path(json.loads(capsys.readouterr().out)["weights"]).is_file()
 
 
@@ -389,10 +426,10 @@ def test_your_own_architecture_is_trained_by_a_configuration(
     config = yaml.safe_load((resource("configs") / "smoke.yaml").read_text())
     config["model"] = {"class_path": "mypackage.TwoBranches", "init_args": {"width": 16, "optimizer": "adamw"}}
     (here / "my_net.yaml").write_text(yaml.safe_dump(config))
-    training.main(["fit", "--config", "my_net.yaml", *arguments, "--json"])
+    main(["fit", "--config", "my_net.yaml", *arguments, "--json"])
     weights = Path(json.loads(capsys.readouterr().out)["weights"])
     assert weights.name == "my_net.safetensors"
-    training.main(["test", "--config", "my_net.yaml", *arguments, "--json", "--ckpt_path", str(weights.parent)])
+    main(["test", "--config", "my_net.yaml", *arguments, "--json", "--ckpt_path", str(weights.parent)])
     assert json.loads(capsys.readouterr().out)["test_loss"] > 0
 
 
@@ -400,15 +437,15 @@ def test_your_own_architecture_is_trained_by_a_configuration(
 def test_the_configuration_beats_what_a_checkpoint_stores(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    training.main(["fit", *SMOKE, *arguments, "--model.learning_rate", "0.01"])
+    main(["fit", *SMOKE, *arguments, "--model.learning_rate", "0.01"])
     path = Path("runs/smoke/version_0/checkpoints/best.ckpt")
     checkpoint = torch.load(path, weights_only=True)
     assert "hyper_parameters" not in checkpoint
     checkpoint["hyper_parameters"] = {"learning_rate": 0.01, "_class_path": "dexzoo.models.em2.EM2"}
     torch.save(checkpoint, path)
     seen = []
-    monkeypatch.setattr(training.CommandLine, "test", lambda self, **_: seen.append(self.model.learning_rate))
-    training.main(["test", *SMOKE, *arguments, "--model.learning_rate", "0.5", "--ckpt_path", str(path)])
+    monkeypatch.setattr(CommandLine, "test", lambda self, **_: seen.append(self.model.learning_rate))
+    main(["test", *SMOKE, *arguments, "--model.learning_rate", "0.5", "--ckpt_path", str(path)])
     assert seen == [0.5]
 
 
@@ -477,7 +514,7 @@ def test_calls_that_are_wrong_get_one_line(arguments: list[str], tmp_path: Path)
     wrong.append((["test", *SMOKE, *arguments, *blind[-2:]], "than em2 as configured, by [0-9]+ tensors such as"))
     for args, message in wrong:
         with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
-            training.main(args)
+            main(args)
         assert "\n" not in str(caught.value)
 
 
@@ -487,14 +524,14 @@ def test_a_logger_without_its_package_says_how_to_get_it(arguments: list[str], m
         monkeypatch.setattr(f"lightning.fabric.loggers.tensorboard.{package}", False)
     for name in ("TensorBoardLogger", "lightning.pytorch.loggers.TensorBoardLogger"):
         with pytest.raises(ValueError, match=r"needs tensorboard; .*`pip install dexzoo\[tensorboard\]`$") as caught:
-            training.main(["fit", *SMOKE, *arguments, f"--trainer.logger={name}"])
+            main(["fit", *SMOKE, *arguments, f"--trainer.logger={name}"])
         assert "\n" not in str(caught.value)
 
 
 def test_help_ends_well(capsys: pytest.CaptureFixture[str]) -> None:
     for args in (["fit", "--help"], ["--help"]):
         with pytest.raises(SystemExit) as caught:
-            training.main(args)
+            main(args)
         assert caught.value.code == 0
     assert "predict" in capsys.readouterr().out
 
@@ -573,12 +610,12 @@ def test_names_and_places_that_do_not_exist(tmp_path: Path, monkeypatch: pytest.
         zoo.load(tmp_path / "none.safetensors")
     with pytest.raises(FileNotFoundError, match=r"must hold one \.safetensors file of weights, found none"):
         zoo.load(tmp_path)
-    with pytest.raises(ValueError, match="must be hf://ORGANISATION/REPOSITORY"):
+    with pytest.raises(ValueError, match="must be hf://ORGANIZATION/REPOSITORY"):
         zoo.load("hf://em2")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(ValueError, match=r"needs huggingface_hub; install it with `pip install dexzoo\[hub\]`"):
         zoo.load("hf://someone/em2")
-    monkeypatch.setattr(zoo, "resource", lambda name: tmp_path if name == "checkpoints" else resource(name))
+    monkeypatch.setattr(registry, "resource", lambda name: tmp_path if name == "checkpoints" else resource(name))
     for name, how in (
         ("em1", r"train them with .*--config em1-adamw\.yaml"),
         ("ffh", r"train them with .*--config ffh\.yaml"),

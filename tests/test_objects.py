@@ -48,7 +48,7 @@ def test_parts_of_one_density_add_up() -> None:
         np.testing.assert_allclose(ours, expected, atol=1e-12)
 
 
-def test_a_larger_part_draws_the_centre() -> None:
+def test_a_larger_part_draws_the_center() -> None:
     parts = [box([0.06, 0.06, 0.06]), box([0.02, 0.06, 0.06]).apply_translation([0.04, 0, 0])]
     center, _ = ObjectModel.from_mesh(trimesh.util.concatenate(parts), 1.0, 0.7, parts).inertia
     np.testing.assert_allclose(center, [0.01, 0, 0], atol=1e-12)
@@ -157,7 +157,7 @@ def faceless_vertex() -> trimesh.Trimesh:
         (lambda: solid(not_finite()), "mesh object has vertices that are not finite"),
         (
             lambda: solid(CUBE.copy().apply_scale(1000)),
-            r"mesh object is 100\.0 m large and looks like millimetres; divide it by 1000",
+            r"mesh object is 100\.0 m large and looks like millimeters; divide it by 1000",
         ),
         (lambda: solid(box([0.1, 0.1, 1e-5])), r"mesh object is flat: 0\.01 mm thick, expected at least 0\.5 mm"),
         (lambda: solid(CUBE, mass=0.0), r"object object has a mass of 0\.0 kg; give a positive one"),

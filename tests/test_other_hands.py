@@ -13,14 +13,14 @@ import torch
 import trimesh
 from torch.autograd import gradcheck
 
-from dexzoo.cli import main
-from dexzoo.grasp import JOINTS, Grasps
+from dexzoo.cli.main import main
+from dexzoo.grasp import Grasps
 from dexzoo.hand import Hand, Side
 from dexzoo.resources import resource
 from dexzoo.sim import Outcomes, Scene
 from dexzoo.sim.robot import add_hand
 from dexzoo.sim.trial import run
-from dexzoo.viewer import view_hand
+from dexzoo.viewing.hand_page import view_hand
 
 PAGE = Path(__file__).parent.parent / "docs" / "your-hand.md"
 
@@ -32,25 +32,23 @@ def blocks(language: str) -> list[str]:
 # --- the left hand ---------------------------------------------------------------------------------------------------
 
 
-def mirrored(grasps: Grasps) -> Grasps:
-    """What the other hand does on the other side of the plane y = 0 of the world."""
-    waypoints = grasps.waypoints.clone()
-    waypoints[..., [1, 4, 6]] *= -1  # y; x and z of the quaternion
-    waypoints[..., JOINTS][..., 0::4] *= -1  # abduction
-    return Grasps(waypoints, "world")
+def mirrored(grasps: Grasps, hand: Hand) -> Grasps:
+    """The same by some hand on the other side of the plane y = 0 of the world."""
+    wrist, joints = grasps.wrist.clone(), grasps.joints.clone()
+    wrist[..., [1, 4, 6]] *= -1  # y; x and z of the quaternion
+    joints[..., 0::4] *= -1  # abduction
+    return Grasps(wrist, joints, grasps.grasp_type, hand)
 
 
 def test_the_left_hand_holds_what_the_right_one_holds(
     can_scene: Scene, can_grasps: Grasps, can_outcomes: Outcomes
 ) -> None:
-    assert can_scene.T_world_camera is not None
-    grasps = can_grasps.to_frame("world", can_scene.T_world_camera)[can_outcomes.success]
+    grasps = can_grasps[can_outcomes.success]
     flip = np.diag([1.0, -1, 1, 1])
     scene = Scene(can_scene.object, flip @ can_scene.T_world_object @ flip)  # the can is its own mirror image
-    left = Hand.load("dlr2", side="left")
     # near the edge a trial is chaotic, and masses are mirrored only to rounding
-    assert run(scene, mirrored(grasps), left).success.mean() > 0.7
-    assert run(scene, mirrored(grasps), Hand.load("dlr2")).success.mean() < 0.3
+    assert run(scene, mirrored(grasps, Hand.load("dlr2", side="left"))).success.mean() > 0.7
+    assert run(scene, mirrored(grasps, Hand.load("dlr2"))).success.mean() < 0.3
 
 
 # --- a hand of three fingers -----------------------------------------------------------------------------------------

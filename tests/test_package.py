@@ -41,6 +41,7 @@ def test_the_wheel_carries_robots_configs_and_checkpoints(wheel: Path) -> None:
         files = [path for path in (ROOT / source).rglob("*") if path.is_file() and path.suffix not in {".py", ".pyc"}]
         missing = {f"dexzoo/resources/{folder}/{path.relative_to(ROOT / source).as_posix()}" for path in files} - names
         assert not missing
+    assert "dexzoo/py.typed" in names
     assert not [name for name in names if name.startswith(("tests/", "dexzoo/resources/")) and name.endswith(".py")]
 
 

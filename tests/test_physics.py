@@ -41,7 +41,7 @@ def between_plates(
 
 
 def fall(mass: float, friction: float, force: float, seconds: float, physics: Physics) -> float:
-    """Metres that the cube sinks between the plates, after a tenth of a second for the contacts to build up."""
+    """Meters that the cube sinks between the plates, after a tenth of a second for the contacts to build up."""
     model, data = between_plates(mass, friction, force, physics)
     mujoco.mj_step(model, data, round(0.1 / physics.timestep))
     start = data.qpos[2]

@@ -9,20 +9,21 @@ import pytest
 import synthetic
 import torch
 
-from dexzoo import cli
-from dexzoo.camera import Observation
-from dexzoo.data import refined
+from dexzoo.cli import main
+from dexzoo.collection import refined
+from dexzoo.collection.refined import SLICE_SCENES, Refining, collect_refined
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.grasp_set import GraspSet
-from dexzoo.data.refined import SLICE_SCENES, Refining, collect_refined
 from dexzoo.data.schema import encode_path, encode_view
 from dexzoo.data.writer import GraspSetWriter, scene_rows
 from dexzoo.generators.demonstration import load_demonstrations
 from dexzoo.generators.kopicki import KopickiGenerator
 from dexzoo.grasp import GRIP, Grasps
-from dexzoo.hand import default_hand
+from dexzoo.hand import Hand
 from dexzoo.models.em_fk import EMFK
-from dexzoo.refinement import Region, Weights, method
+from dexzoo.perception.observation import Observation
+from dexzoo.refinement import TrustRegion, refinement
+from dexzoo.refinement.terms import Table
 from dexzoo.sim import Outcomes, Scene, trial
 
 NUM = 8
@@ -31,7 +32,7 @@ SCENES = {0: "train", 1: "test", SLICE_SCENES: "train", 2 * SLICE_SCENES: "test"
 
 @pytest.fixture(scope="module")
 def evaluator(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """An EM-FK that has learnt nothing yet, but has a slope."""
+    """An EM-FK that has learned nothing yet, but has a slope."""
     torch.manual_seed(0)
     model = EMFK(width=32, num_blocks=1, image=False)
     with torch.no_grad():
@@ -40,9 +41,9 @@ def evaluator(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def generator() -> KopickiGenerator:
+def generator(hand: Hand) -> KopickiGenerator:
     """One that knows few demonstrations, whose density is quickly made."""
-    return KopickiGenerator(load_demonstrations()[:2], num_kernels=1000)
+    return KopickiGenerator(load_demonstrations(hand)[:2], num_kernels=1000)
 
 
 @pytest.fixture(autouse=True)
@@ -52,20 +53,19 @@ def in_this_process(generator: KopickiGenerator, monkeypatch: pytest.MonkeyPatch
         return map(function, numbers)
 
     monkeypatch.setattr(refined, "in_processes", one_by_one)
-    monkeypatch.setattr(refined, "default_generator", lambda: generator)
+    monkeypatch.setattr(refined, "make_generator", lambda name, hand: generator)
 
 
 @pytest.fixture
 def folder(tmp_path: Path, can_scene: Scene, can_view: Observation, can_grasps: Grasps, can_outcomes: Outcomes) -> Path:
     """The scene of the can several times over, as of training and of test objects, with grasps and one view."""
-    world = can_grasps[:NUM].to_frame("world", can_view.T_world_camera)
-    obj = can_scene.object
+    grasps, obj = can_grasps[:NUM], can_scene.object
     columns = {
         "view": [0] * NUM,
-        "grasp_type": world.grasp_type.numpy(),
+        "grasp_type": grasps.grasp_type.numpy(),
         "source": ["generated"] * (NUM - 1) + ["perturbed"],
         "rank": np.arange(NUM),
-        "path": encode_path(world, default_hand()),
+        "path": encode_path(grasps),
         "success": can_outcomes.success[:NUM],
     }
     row = {
@@ -106,9 +106,9 @@ def test_refined_grasps_of_training_objects_join_the_set(
         same = generated & (grasp_set.grasp_scene == grasp_set.grasp_scene[row]) & (rank == rank[row])
         (parent,) = np.flatnonzero(same)
         apart = (world.position[row, GRIP] - world.position[parent, GRIP]).norm()
-        assert 0 < float(apart) < 3**0.5 * Region().wrist + 1e-4
+        assert 0 < float(apart) < 3**0.5 * TrustRegion().wrist + 1e-4
         assert world.grasp_type[row] == world.grasp_type[parent]
-    again = trial.run(can_scene, world[np.flatnonzero(new)], default_hand(), num_threads=1)
+    again = trial.run(can_scene, world[np.flatnonzero(new)], num_threads=1)
     np.testing.assert_array_equal(again.success, grasp_set.success[new])
     module = GraspDataModule(str(folder), sources=["refined"])
     assert len(module._rows("train", ["refined"])) == new.sum()
@@ -144,8 +144,8 @@ def test_a_round_can_be_continued_and_repeated(folder: Path, evaluator: str, tmp
 
 
 def test_the_command_adds_to_a_set(folder: Path, evaluator: str, capsys: pytest.CaptureFixture[str]) -> None:
-    args = ["collect", "--out", str(folder), "--refine", evaluator, "--num_grasps", "2", "--json"]
-    assert cli.main(args) == 0
+    args = ["collect_refined", "--out", str(folder), "--evaluator", evaluator, "--num_grasps", "2", "--json"]
+    assert main(args) == 0
     out, err = capsys.readouterr()
     assert err == ""
     assert f'"refined": {(GraspSet(folder).source == "refined").sum()}' in out
@@ -170,20 +170,24 @@ def test_a_round_of_other_settings_or_of_a_set_that_grew_is_not_continued(
     manifest = folder / "manifest.json"
     made = json.loads(manifest.read_text())["configuration"]["refined1"]
     assert made["num_scenes"] == 2
-    assert made["region"]["wrist"] == Region().wrist
-    assert made["weights"]["table"] == Weights().table
+    assert made["trust_region"]["wrist"] == TrustRegion().wrist
+    assert made["terms"]["table"] == Table().weight
+    assert made["terms"]["prior"] == 0.05
     assert made["num_steps"] == 30
     assert made["step_size"] == 0.2
-    assert made["clearance"] == {"table": 0.002, "around": 0.007, "middle": 0.35, "lack": 0.001}
-    for module, name, value, told in (
-        (method, "NUM_STEPS", 20, "'num_steps': 30"),
-        (method, "STEP_SIZE", 0.1, "'step_size': 0.2"),
-        (method, "AROUND", 0.005, "'clearance': {"),
+    assert made["clearance"] == {"table": 0.002, "around": 0.007, "support": 0.35, "lack": 0.001}
+    assert made["shadow"] == [0.007, 0.014]
+    for home, name, value, differs in (
+        (refinement, "NUM_STEPS", 20, "'num_steps': 30"),
+        (refinement, "STEP_SIZE", 0.1, "'step_size': 0.2"),
+        (refinement, "AROUND", 0.005, "'clearance': {"),
+        (refinement, "SHADOW_DEPTHS", (0.007,), "'shadow': "),
+        (refinement, "WEIGHTS", {"table": -100.0}, "'terms': {"),
         (refined, "training_scenes", lambda folder: [0, 1, SLICE_SCENES], "'num_scenes': 2"),
     ):
         with monkeypatch.context() as patch:
-            patch.setattr(module, name, value)
-            message = rf"refined1 of grasp set .* was made with {{{told}.*; start another --round"
+            patch.setattr(home, name, value)
+            message = rf"refined1 of grasp set .* was made with {{{differs}.*; start another --round"
             with pytest.raises(ValueError, match=message):
                 next(iter(collect_refined(folder, how)))
     old = json.loads(manifest.read_text())

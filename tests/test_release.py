@@ -10,12 +10,12 @@ import synthetic
 import torch
 from safetensors.torch import load_file
 
-from dexzoo import training
-from dexzoo.models import zoo
+from dexzoo.models import registry, zoo
 from dexzoo.resources import resource
+from dexzoo.training import command_line
 
 ROOT = Path(__file__).parent.parent
-SHIPPED = [name for name in zoo.list_models() if zoo.shipped_card(name)]
+SHIPPED = [name for name in registry.list_models() if registry.shipped_card(name)]
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def release(monkeypatch: pytest.MonkeyPatch):  # noqa: ANN201, a module
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_weights_reproduce_the_auroc_in_their_card(name: str, release: Any) -> None:  # noqa: ANN401
-    card = zoo.shipped_card(name)
+    card = registry.shipped_card(name)
     assert card is not None
     assert card.keys() >= {"arguments", "data", "metrics", "seed", "command", "limits", "sha256"}
     expected = card["small_part"]
@@ -55,7 +55,7 @@ def test_a_run_is_shipped_in_half_precision_where_no_figure_moves(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     grasps = str(synthetic.write(tmp_path / "grasps"))
     steps = ["--trainer.max_steps=6", "--trainer.val_check_interval=3", "--model.width=32"]
-    training.main(["fit", "--config=smoke.yaml", *steps, "--data.folder", grasps])
+    command_line.main(["fit", "--config=smoke.yaml", *steps, "--data.folder", grasps])
     run = tmp_path / "runs" / "smoke" / "version_0"
     best = torch.load(run / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"]
     (tmp_path / "half").mkdir()

@@ -7,7 +7,7 @@ import torch
 
 from dexzoo import rotation
 from dexzoo.hand import Hand, Side
-from dexzoo.sim.robot import SQUEEZE_ANGLE, add_hand
+from dexzoo.sim.robot import FULL_EFFORT_ANGLE, add_hand
 
 Twin = tuple[Hand, mujoco.MjModel, mujoco.MjData]
 
@@ -97,9 +97,9 @@ def test_a_servo_gives_its_effort_and_no_more() -> None:
         for joint in hand.spec.joints:
             if joint.axis is not None:
                 assert abs(data.actuator(joint.name).force[0]) <= joint.effort + 1e-9
-    # where the joint is held, the servo presses with its whole effort as far as SQUEEZE_ANGLE past it
+    # where the joint is held, the servo presses with its whole effort as far as FULL_EFFORT_ANGLE past it
     mujoco.mj_resetData(model, data)
-    command(twin, torch.full((20,), SQUEEZE_ANGLE / 2, dtype=torch.float64))
+    command(twin, torch.full((20,), FULL_EFFORT_ANGLE / 2, dtype=torch.float64))
     mujoco.mj_forward(model, data)
     for joint in hand.spec.joints:
         if joint.axis is not None:

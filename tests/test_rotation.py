@@ -144,3 +144,19 @@ def test_random_is_uniform_and_repeats_with_the_seed() -> None:
     assert torch.equal(first, second)
     # the mean of uniformly turned vectors vanishes as 1/sqrt(n)
     assert rotation.rotate(first, torch.tensor([1.0, 0, 0])).mean(0).norm() < 0.06
+
+
+def test_a_pose_steps_in_its_own_frame_and_stays_in_its_box() -> None:
+    pose = rotation.pose_matrix(
+        torch.tensor([0.1, 0.2, 0.3]), rotation.from_axis_angle(torch.tensor([0.0, 0, 1]), torch.tensor(0.5))
+    )
+    ahead = rotation.step_pose(pose, torch.tensor([0.01, 0, 0, 0, 0, 0.2]))
+    assert torch.allclose(ahead[:3, 3] - pose[:3, 3], 0.01 * pose[:3, 0], atol=1e-6)
+    turn = rotation.log(rotation.from_matrix(pose[:3, :3].T @ ahead[:3, :3]))
+    assert torch.allclose(turn, torch.tensor([0.0, 0, 0.2]), atol=1e-5)
+    box = torch.tensor([0.005] * 3 + [0.05] * 3)
+    far = torch.linalg.inv(pose) @ rotation.step_pose(pose, torch.full((6,), 9.0), box)
+    assert (far[:3, 3].abs() <= 0.005 + 1e-6).all()
+    assert torch.allclose(
+        rotation.step_pose(pose, 1e-5 * torch.ones(6), box), rotation.step_pose(pose, 1e-5 * torch.ones(6)), atol=1e-7
+    )

@@ -1,6 +1,6 @@
 """The hand's twin in MuJoCo, objects at rest on the table, and the camera against an independent ray cast."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from xml.etree import ElementTree
 
 import mujoco
@@ -10,8 +10,9 @@ import torch
 import trimesh
 import yaml
 
-from dexzoo.camera import Camera, Observation, look_at
 from dexzoo.hand import Hand
+from dexzoo.perception.camera import Camera, look_at
+from dexzoo.perception.observation import Observation
 from dexzoo.resources import resource
 from dexzoo.sim import ObjectModel, Scene
 from dexzoo.sim.shapes import make_object
@@ -32,7 +33,7 @@ def twin(can_scene: Scene, hand: Hand) -> mujoco.MjModel:
 
 @pytest.fixture
 def raised(twin: mujoco.MjModel) -> mujoco.MjData:
-    """The state with the hand one metre over the table."""
+    """The state with the hand one meter over the table."""
     data = mujoco.MjData(twin)
     at = twin.joint("wrist").qposadr[0]
     data.qpos[at : at + 7] = [0, 0, 1, 1, 0, 0, 0]
@@ -204,11 +205,10 @@ def test_the_objects_friction_and_no_other_acts(can_scene: Scene, hand: Hand) ->
 
 
 def test_drawn_views_are_those_of_the_grasp_set(can_scene: Scene) -> None:
-    scene = replace(can_scene)
-    middle = scene.T_world_object[:3, :3] @ scene.object.mesh.bounds.mean(0) + scene.T_world_object[:3, 3]
+    middle = can_scene.T_world_object[:3, :3] @ can_scene.object.mesh.bounds.mean(0) + can_scene.T_world_object[:3, 3]
     elevations, azimuths = [], []
     for seed in range(40):
-        T = scene.observe(seed=seed, camera=SMALL).T_world_camera
+        T = can_scene.observe(seed=seed, camera=SMALL).T_world_camera
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(T[:3, :3]) > 0
         assert T[2, 0] == pytest.approx(0, abs=1e-12), "the image is upright"
@@ -253,19 +253,18 @@ def test_ideal_points_lie_on_the_object_and_noisy_ones_near_it(can_scene: Scene,
         chosen = np.random.default_rng(0).permutation(len(points))[:500]
         return trimesh.proximity.closest_point(mesh, points[chosen])[1]
 
-    ideal = replace(can_scene).observe(seed=1, ideal=True)
+    ideal = can_scene.observe(seed=1, ideal=True)
     assert np.abs(ideal.T_world_camera - can_view.T_world_camera)[:, :3].max() < 1e-12
     assert distance(ideal.points_world).max() < 1e-4
 
 
 def test_the_camera_stands_a_little_off_and_the_table_is_where_it_is_seen(can_scene: Scene) -> None:
     pose = look_at(np.array([0.0, 0, 0.05]), 0.6, 1.0, 0.8)
-    scene = replace(can_scene)
-    ideal = scene.observe(camera=SMALL, T_world_camera=pose, ideal=True)
+    ideal = can_scene.observe(camera=SMALL, T_world_camera=pose, ideal=True)
     np.testing.assert_allclose(ideal.table, pose[2], atol=1e-12)
     off = []
     for seed in range(100):
-        observation = scene.observe(seed, SMALL, pose)
+        observation = can_scene.observe(seed, SMALL, pose)
         np.testing.assert_allclose(observation.T_world_camera[:2], pose[:2], atol=1e-12)
         np.testing.assert_allclose(observation.T_world_camera[2], observation.table, atol=1e-12)
         np.testing.assert_allclose(observation.table[:3], pose[2, :3], atol=1e-12)
@@ -279,15 +278,14 @@ def test_the_camera_stands_a_little_off_and_the_table_is_where_it_is_seen(can_sc
 def test_points_are_off_by_as_much_as_the_camera(can_scene: Scene) -> None:
     """The middle of the can's top, seen from one place, is seen 4 mm off along the table, at its true height."""
     pose = look_at(np.array([0.0, 0, 0.05]), 0.5, 1.0, 0.8)
-    scene = replace(can_scene)
 
     def top(observation: Observation) -> np.ndarray:
         points = observation.points_world
         points = points[points[:, 2] > np.quantile(points[:, 2], 0.98) - 0.004]
         return (points.min(0) + points.max(0)) / 2
 
-    moved = [top(scene.observe(seed, T_world_camera=pose)) for seed in range(30)]
-    assert np.abs(np.mean(moved, axis=0) - top(scene.observe(T_world_camera=pose, ideal=True))).max() < 0.003
+    moved = [top(can_scene.observe(seed, T_world_camera=pose)) for seed in range(30)]
+    assert np.abs(np.mean(moved, axis=0) - top(can_scene.observe(T_world_camera=pose, ideal=True))).max() < 0.003
     spread = np.std(moved, axis=0)
     assert (spread[:2] > 0.0025).all()
     assert (spread[:2] < 0.0065).all()
@@ -312,9 +310,8 @@ def test_ideal_depth_of_a_box_is_exact() -> None:
 
 
 def test_the_projector_casts_shadows_to_the_left_and_no_other_side(can_scene: Scene) -> None:
-    scene = replace(can_scene)
     pose = look_at(np.array([0.0, 0, 0.05]), 0.5, 1.0, 0.7)
-    observation = scene.observe(T_world_camera=pose)
+    observation = can_scene.observe(T_world_camera=pose)
     column = observation.camera.project(observation.points)[:, 0]
     rows = np.flatnonzero(observation.mask.any(1))
     middle = observation.depth[rows[len(rows) // 4] : rows[len(rows) // 2]] == 0
@@ -347,23 +344,38 @@ def test_the_shadow_is_where_its_own_geometry_puts_it() -> None:
     assert lit[~table & (exact.depth > 0)].mean() > 0.9
 
 
-def test_a_given_camera_and_pose_are_honoured(can_scene: Scene) -> None:
-    scene = replace(can_scene, T_world_camera=None)
+def test_a_given_camera_and_pose_are_honored(can_scene: Scene) -> None:
     pose = look_at(np.array([0.0, 0, 0.05]), 0.5, 1.0, 0.8)
-    observation = scene.observe(camera=SMALL, T_world_camera=pose, ideal=True)
+    observation = can_scene.observe(camera=SMALL, T_world_camera=pose, ideal=True)
     assert observation.camera == SMALL
     np.testing.assert_array_equal(observation.T_world_camera, pose)
-    np.testing.assert_array_equal(scene.T_world_camera, pose)
     # the middle pixel sees the can where the gaze meets its side or top
-    T = scene.T_world_object
-    height, radius = scene.object.mesh.extents[2], scene.object.mesh.extents[0] / 2
+    T = can_scene.T_world_object
+    height, radius = can_scene.object.mesh.extents[2], can_scene.object.mesh.extents[0] / 2
     x, y, z = pose[:3, 3] + observation.depth[72, 96] * pose[:3, 2] - T[:3, 3]
     assert np.hypot(x, y) == pytest.approx(radius, rel=0.02) or z == pytest.approx(height, abs=1e-3)
 
 
 @pytest.mark.parametrize(("target", "distance"), [((2.0, 2.0, 0.0), 0.5), ((0.0, 0.0, 0.05), 1.3)])
 def test_an_object_out_of_sight_is_reported(can_scene: Scene, target: tuple[float, ...], distance: float) -> None:
-    scene = replace(can_scene, T_world_camera=None)
     with pytest.raises(ValueError, match=r"object can_07 covers \d+ pixels, fewer than 250"):
-        scene.observe(camera=SMALL, T_world_camera=look_at(np.array(target), distance, 0.0, 0.8))
-    assert scene.T_world_camera is None, "a view that failed leaves no camera"
+        can_scene.observe(camera=SMALL, T_world_camera=look_at(np.array(target), distance, 0.0, 0.8))
+
+
+def test_to_observe_a_scene_changes_nothing_in_it(can_scene: Scene, hand: Hand) -> None:
+    scene = replace(can_scene, T_world_object=can_scene.T_world_object.copy())
+    first = scene.observe(seed=1, camera=SMALL)
+    scene.observe(seed=2, camera=SMALL)
+    scene.observe(T_world_camera=look_at(np.array([0.0, 0, 0.05]), 0.5, 1.0, 0.8), ideal=True)
+    with pytest.raises(ValueError, match="pixels"):
+        scene.observe(T_world_camera=look_at(np.array([2.0, 2, 0]), 0.5, 0.0, 0.8))
+    assert [field.name for field in fields(scene)] == ["object", "T_world_object", "support"]
+    assert scene.object is can_scene.object
+    assert scene.support is None
+    np.testing.assert_array_equal(scene.T_world_object, can_scene.T_world_object)
+    again = scene.observe(seed=1, camera=SMALL)
+    assert again.depth.tobytes() == first.depth.tobytes()
+    np.testing.assert_array_equal(again.T_world_camera, first.T_world_camera)
+    ours, theirs = (s.model(hand.spec) for s in (scene, can_scene))
+    for name in ("geom_pos", "geom_quat", "geom_size", "geom_friction", "body_mass", "body_inertia", "qpos0"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), name)

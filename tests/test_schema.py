@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from dexzoo.camera import Camera, Observation
 from dexzoo.data.schema import DEPTH_UNIT, SCHEMAS, decode_path, decode_view, encode_depth, encode_path, encode_view
 from dexzoo.grasp import Grasps
-from dexzoo.hand import Hand
-
-
-@pytest.fixture(scope="module")
-def world(can_grasps: Grasps, can_view: Observation) -> Grasps:
-    return can_grasps[:6].to_frame("world", can_view.T_world_camera)
+from dexzoo.perception.camera import Camera
+from dexzoo.perception.observation import Observation
 
 
 @pytest.fixture
@@ -24,24 +19,28 @@ def row(can_view: Observation) -> dict[str, Any]:
     return {"scene": 3, "view": 1, **encode_view(can_view.aimed())}
 
 
-def test_a_path_keeps_the_grasp(world: Grasps, hand: Hand) -> None:
-    path = encode_path(world, hand)
-    assert path.shape == (len(world), 66)
+def test_a_path_keeps_the_grasp(can_grasps: Grasps) -> None:
+    grasps = can_grasps[:6]
+    path = encode_path(grasps)
+    assert path.shape == (6, 66)
     assert path.dtype == np.float32
-    back = decode_path(path, world.grasp_type, hand)
-    assert back.frame == "world"
-    torch.testing.assert_close(back.waypoints, world.waypoints, atol=1e-5, rtol=0)
+    back = decode_path(path, grasps.grasp_type, grasps.hand)
+    assert back.hand == grasps.hand
+    torch.testing.assert_close(back.wrist, grasps.wrist, atol=1e-5, rtol=0)
+    torch.testing.assert_close(back.joints, grasps.joints, atol=1e-5, rtol=0)
+    assert torch.equal(back.grasp_type, grasps.grasp_type)
 
 
-def test_a_path_holds_what_the_docstring_says(world: Grasps, hand: Hand) -> None:
-    path = torch.from_numpy(encode_path(world, hand)).unflatten(-1, (3, 22))
+def test_a_path_holds_what_the_docstring_says(can_grasps: Grasps) -> None:
+    grasps = can_grasps[:6]
+    path = torch.from_numpy(encode_path(grasps)).unflatten(-1, (3, 22))
     for row, waypoint in enumerate((0, 6, 9)):
-        assert torch.equal(path[:, row, :3], world.position[:, waypoint])
-        assert torch.equal(path[:, row, 3:7], world.quaternion[:, waypoint])
-        assert torch.equal(hand.expand(path[:, row, 7:]), world.joints[:, waypoint])
+        assert torch.equal(path[:, row, :3], grasps.position[:, waypoint])
+        assert torch.equal(path[:, row, 3:7], grasps.quaternion[:, waypoint])
+        assert torch.equal(grasps.hand.expand(path[:, row, 7:]), grasps.joints[:, waypoint])
 
 
-def test_a_view_is_kept_to_a_tenth_of_a_millimetre(can_view: Observation, row: dict[str, Any]) -> None:
+def test_a_view_is_kept_to_a_tenth_of_a_millimeter(can_view: Observation, row: dict[str, Any]) -> None:
     aimed = can_view.aimed()
     back = decode_view(row, row["depth"])
     assert back.camera == aimed.camera

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dexzoo.camera import Camera
-from dexzoo.sensor import BASELINE, DISPARITY_NOISE, DISPARITY_STEP, read_depth
+from dexzoo.perception.camera import Camera
+from dexzoo.sim.sensor import BASELINE, DISPARITY_NOISE, DISPARITY_STEP, read_depth
 
 CAMERA = Camera()
 LIT = np.ones((480, 640), bool)
@@ -37,7 +37,7 @@ def test_disparity_has_the_steps_and_the_noise_of_the_parameters() -> None:
     assert np.abs(error).max() < 6 * DISPARITY_NOISE
 
 
-def test_noise_is_alike_in_neighbours_and_not_farther_apart() -> None:
+def test_noise_is_alike_in_neighbors_and_not_farther_apart() -> None:
     error = disparity(read(slope())) - disparity(slope())
 
     def alike(step: int) -> float:

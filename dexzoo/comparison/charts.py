@@ -12,13 +12,21 @@ from matplotlib.figure import Figure
 from dexzoo.comparison.scores import COIN, GM
 
 Rows = dict[str, dict[str, Any]]
-_GREYS = {GM: "0.35", COIN: "0.7"}
+_GRAYS = {GM: "0.35", COIN: "0.7"}
 _MIN_GRASPS = 10
 """Fewer in a bin say nothing of its success rate."""
 
 
 def draw_charts(result: dict[str, Any], folder: Path) -> list[Path]:
-    """Write rank.png, reliability.png and categories.png of the first source, the generated grasps; their paths."""
+    """Write rank.png, reliability.png and categories.png of the first source, the generated grasps.
+
+    Args:
+        result: As of `compare`.
+        folder: Folder to write to.
+
+    Returns:
+        Their paths.
+    """
     section = next(iter(result["sources"].values()))
     rows = dict(section["rows"])
     rank = save(rank_chart(rows, section["success_rate"]), folder / "rank.png")
@@ -28,7 +36,12 @@ def draw_charts(result: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def rank_chart(rows: Rows, base: float) -> Figure:
-    """Success by tenth of rank (thesis, Fig. 3.13), with 95 % bands; base: success rate of all grasps."""
+    """Success by tenth of rank (thesis, Fig. 3.13), with 95 % bands.
+
+    Args:
+        rows: Rows by name.
+        base: Success rate of all grasps.
+    """
     figure, axes = _axes(6.4, 4.2)
     tenth = np.arange(1, 11)
     for name, row in rows.items():
@@ -45,7 +58,11 @@ def rank_chart(rows: Rows, base: float) -> Figure:
 
 
 def reliability_chart(rows: Rows) -> Figure:
-    """Success rate against predicted probability, for the rows that predict one."""
+    """Success rate against predicted probability, for the rows that predict one.
+
+    Args:
+        rows: Rows by name.
+    """
     figure, axes = _axes(4.8, 4.8)
     axes.plot([0, 100], [0, 100], color="0.5", linewidth=0.8, linestyle=":", label="as predicted")
     for name, row in rows.items():
@@ -64,7 +81,11 @@ def reliability_chart(rows: Rows) -> Figure:
 
 
 def category_chart(rows: Rows) -> Figure:
-    """Success of the first grasp by category, the most difficult at the bottom."""
+    """Success of the first grasp by category, the most difficult at the bottom.
+
+    Args:
+        rows: Rows by name.
+    """
     categories = next(iter(rows.values()))["by_category"]
     order = sorted(categories, key=lambda name: categories[name]["success_rate"])
     figure, axes = _axes(6.4, 1.4 + 0.3 * len(order))
@@ -83,7 +104,15 @@ def category_chart(rows: Rows) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a chart as PNG; returns the path."""
+    """Write a chart as PNG.
+
+    Args:
+        figure: The chart.
+        path: File to write.
+
+    Returns:
+        The path.
+    """
     figure.savefig(path, dpi=120, bbox_inches="tight", metadata={"Software": None})
     return path
 
@@ -96,8 +125,8 @@ def _axes(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 def _style(name: str, rows: Rows) -> dict[str, Any]:
-    if name in _GREYS:
-        return {"color": _GREYS[name], "linewidth": 1.2, "linestyle": "--"}
+    if name in _GRAYS:
+        return {"color": _GRAYS[name], "linewidth": 1.2, "linestyle": "--"}
     return {"color": f"C{list(rows).index(name)}", "linewidth": 1.6}
 
 

@@ -26,16 +26,18 @@ from dexzoo.comparison.scores import (
 from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SOURCES, VERSION
 from dexzoo.models.evaluator import GraspEvaluator
-from dexzoo.models.zoo import list_models, load, shipped_card
+from dexzoo.models.registry import list_models, shipped_card
+from dexzoo.models.zoo import load
 
 GENERATED = SOURCES[0]
 
 
 def load_models(models: Sequence[str]) -> dict[str, GraspEvaluator]:
-    """Models by the names of their rows: the last part of a path, without .safetensors, or the whole where it is taken.
+    """Load models by the names of their rows: the last part of a path without .safetensors, or all of it if taken.
 
-    models: names, files, folders or addresses, as `dexzoo.load` takes them; one given twice is loaded once, and if none
-    is given, all that come with weights are.
+    Args:
+        models: Names, files, folders or addresses, as `dexzoo.load` takes them. One given twice is loaded once;
+            if none is given, all that come with weights are.
     """
     models = list(dict.fromkeys(models)) or [name for name in list_models() if shipped_card(name)]
     short = [Path(model).name.removesuffix(".safetensors") for model in models]
@@ -49,18 +51,26 @@ def compare(
 ) -> dict[str, Any]:
     """All figures of some models, of the generator's likelihood (gm) and of a coin on one split of a grasp set.
 
-    models: by the names of their rows. seed: of the coin and of the bootstrap's draws. The same call gives the same
-    result, but for the times in `cost`.
-
-    Returns plain values, ready for JSON: split, seed, num_draws; data (version and checksum of the set); weights, by
-    model, checksums of its file and of its members', None for one that was not read from a file; sources, for
-    generated grasps and, where the split has some, for perturbed and refined ones: how many grasps, objects and scenes,
-    the success rate, and in `rows`, by name, what `figures.describe` and `figures.against` say, the latter of gm, em2
-    and, for the model with the highest top-1, of the next; cost, by model. Ranks are within the grasps of one source in
-    one scene, each seen in the view that the set pairs it with. There is no row gm where the set has no likelihoods;
+    The same call gives the same result, but for the times in `cost`. Ranks are within the grasps of one source in
+    one scene, each seen in the view that the set pairs it with. There is no row gm if the set has no likelihoods;
     its threshold is the most accurate one for the generated grasps of validation.
 
-    Raises FileNotFoundError or ValueError for a set that cannot be had, or a split without generated grasps.
+    Args:
+        models: Models by the names of their rows.
+        data: The grasp set.
+        split: Split that is compared on.
+        seed: Seed of the coin and of the bootstrap's draws.
+
+    Returns:
+        Plain values, ready for JSON: split, seed, num_draws; data (version and checksum of the set); weights (by
+            model, checksums of its file and of its members', None for one that was not read from a file); sources
+            (for generated grasps and, if the split has some, for perturbed and refined ones: number of grasps,
+            objects and scenes, the success rate, and in `rows`, by name, `figures.describe` and `figures.against`,
+            the latter of gm, em2 and, for the model with the highest top-1, of the next); cost, by model.
+
+    Raises:
+        FileNotFoundError: The set cannot be found.
+        ValueError: The set cannot be read, or the split has no generated grasps.
     """
     labels = {source: found for source in SOURCES if (found := read_labels(data, split, source))}
     if GENERATED not in labels:

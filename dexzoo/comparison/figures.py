@@ -1,6 +1,6 @@
 """The figures of one row, each with its bootstrap interval over scenes.
 
-Grasps of one scene share object, pose and luck, so that scenes are what is drawn anew. A draw is how often each scene
+Grasps of one scene share object, pose and luck, so scenes are resampled. A draw is how often each scene
 is taken, and every figure is a function of such weights (draw, scene): a row of ones gives the figure itself, and a
 thousand draws give all its replicates at once, without a grasp being copied.
 """
@@ -33,18 +33,31 @@ _CHUNK = 50
 
 
 def draw_scenes(num_scenes: int, seed: int, num_draws: int = NUM_DRAWS) -> Array:
-    """(1 + draw, scene) how often each is taken: once, then when as many as there are are drawn with replacement."""
+    """Draw how often each scene is taken, (1 + draw, scene): once, then with replacement.
+
+    Args:
+        num_scenes: Number of scenes.
+        seed: Seed of the draws.
+        num_draws: Number of draws.
+    """
     share = np.full(num_scenes, 1 / num_scenes)
     drawn = np.random.default_rng(seed).multinomial(num_scenes, share, num_draws)
     return np.concatenate((np.ones((1, num_scenes)), drawn))
 
 
 def describe(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
-    """All figures of a row, plain values ready for JSON, None where one is not defined.
+    """All figures of a row, plain values ready for JSON, None if one is not defined.
 
-    figures: value and 95 % interval of each. threshold, counts: tp, fp, tn, fn of the predictions at the threshold.
-    by_rank: success rate of each tenth of the scenes' rankings, best first. reliability: of each bin of probability,
-    the grasps, their mean probability and their success rate. by_category: grasps, scenes and a few figures of each.
+    Args:
+        labels: Grasps and their outcomes.
+        scores: Scores of the row.
+        draws: As of `draw_scenes`.
+
+    Returns:
+        figures: value and 95 % interval of each. threshold, counts: tp, fp, tn, fn of the predictions at the
+            threshold. by_rank: success rate of each tenth of the scenes' rankings, best first. reliability: of each
+            bin of probability, the grasps, their mean probability and their success rate. by_category: grasps, scenes
+            and a few figures of each.
     """
     tenths = by_scene(SuccessByRank(), labels, scores).T
     return {
@@ -58,17 +71,28 @@ def describe(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
 
 
 def figures_with_intervals(labels: Labels, scores: Scores, draws: Array) -> dict[str, Any]:
-    """Value and 95 % interval of every figure of a row, plain values."""
+    """Value and 95 % interval of every figure of a row, plain values.
+
+    Args:
+        labels: Grasps and their outcomes.
+        scores: Scores of the row.
+        draws: As of `draw_scenes`.
+    """
     return {name: with_interval(values) for name, values in figures(labels, scores, draws).items()}
 
 
 def figures(labels: Labels, scores: Scores, weights: Array) -> dict[str, Array]:
-    """Every figure of a row by name, each (draw,); nan where it is not defined.
+    """Every figure of a row by name, each (draw,); nan if it is not defined.
 
-    accuracy and balanced_accuracy (the mean of the rates at which successes and failures are recognised) at the row's
-    threshold; auroc over all grasps; scene_auroc, average_precision; brier, the mean squared error of the probability;
-    calibration_error in bins of equal width; top1 and top5, the success rate of each scene's best. Those that need a
-    threshold or a probability are left out where the row has none.
+    accuracy and balanced_accuracy (the mean of the rates at which successes and failures are recognized) at the
+    row's threshold; auroc over all grasps; scene_auroc, average_precision; brier, the mean squared error of the
+    probability; calibration_error in bins of equal width; top1 and top5, the success rate of each scene's best.
+    Those that need a threshold or a probability are left out if the row has none.
+
+    Args:
+        labels: Grasps and their outcomes.
+        scores: Scores of the row.
+        weights: How often each scene is taken, (draw, scene).
     """
     found = {}
     held, size = labels.success, weights @ _sums(labels, np.ones(len(labels.success)))
@@ -89,7 +113,13 @@ def figures(labels: Labels, scores: Scores, weights: Array) -> dict[str, Array]:
 
 
 def ranking(labels: Labels, score: NDArray[np.float32], weights: Array) -> tuple[Array, Array]:
-    """AUROC and average precision, (draw,) each, ties counting half in the one and together in the other."""
+    """AUROC and average precision, (draw,) each, ties counting half in the one and together in the other.
+
+    Args:
+        labels: Grasps and their outcomes.
+        score: Scores, (grasp,).
+        weights: How often each scene is taken, (draw, scene).
+    """
     order = np.argsort(-score, kind="stable")
     last = np.flatnonzero(np.append(np.diff(score[order]) != 0, True))  # of each group of equal scores
     scene, held = labels.scene[order], labels.success[order].astype(np.float64)
@@ -108,19 +138,35 @@ def ranking(labels: Labels, score: NDArray[np.float32], weights: Array) -> tuple
 
 
 def by_scene(metric: SceneMetric, labels: Labels, scores: Scores) -> Array:
-    """The figure of each scene, (scene, ...)."""
+    """The figure of each scene, (scene, ...).
+
+    Args:
+        metric: The metric.
+        labels: Grasps and their outcomes.
+        scores: Scores of the row.
+    """
     metric.update(*(torch.from_numpy(values) for values in (scores.score, labels.success, labels.scene)))
     return np.asarray(metric.by_scene(), np.float64)
 
 
 def mean(values: Array, weights: Array) -> Array:
-    """Mean over scenes of a figure (scene,), without those that have none: (draw,)."""
+    """Mean over scenes, (draw,); scenes without the figure are left out.
+
+    Args:
+        values: Figure of each scene, nan without one, (scene,).
+        weights: How often each scene is taken, (draw, scene).
+    """
     known = np.isfinite(values)
     return _ratio(weights[:, known] @ values[known], weights[:, known].sum(1))
 
 
 def counts(labels: Labels, scores: Scores) -> dict[str, int] | None:
-    """True and false positives, true and false negatives."""
+    """True and false positives, true and false negatives.
+
+    Args:
+        labels: Grasps and their outcomes.
+        scores: Scores of the row.
+    """
     called = scores.predicted
     if called is None:
         return None
@@ -132,7 +178,12 @@ def counts(labels: Labels, scores: Scores) -> dict[str, int] | None:
 
 
 def reliability(labels: Labels, scores: Scores) -> list[dict[str, Any]] | None:
-    """The reliability diagram."""
+    """The reliability diagram.
+
+    Args:
+        labels: Grasps and their outcomes.
+        scores: Scores of the row.
+    """
     if scores.probability is None:
         return None
     metric = CalibrationError(NUM_BINS)
@@ -144,10 +195,18 @@ def reliability(labels: Labels, scores: Scores) -> list[dict[str, Any]] | None:
 
 
 def against(labels: Labels, scores: Scores, other: Scores, name: str, draws: Array) -> dict[str, Any]:
-    """How a row does where another of the given name does, too: what `cross_table` and `gains` say.
+    """A row against another one on the same grasps: `cross_table` and `gains` of both.
 
-    top1: over scenes, whether the first grasp holds, as the thesis counts (Table 3.4). accuracy: over grasps, whether
-    the prediction is right; grasps of a scene are alike, so that its p is too small. None without thresholds.
+    top1: over scenes, whether the first grasp holds, as the thesis counts (Table 3.4). accuracy: over grasps,
+    whether the prediction is right; grasps of a scene are alike, so that its p is too small. None without
+    thresholds.
+
+    Args:
+        labels: Grasps and their outcomes.
+        scores: Scores of the row.
+        other: Scores of the other row.
+        name: Name of the other row.
+        draws: As of `draw_scenes`.
     """
     scenes = np.arange(labels.num_scenes)
     first, other_first = (by_scene(TopKSuccess(1), labels, row) > 0.5 for row in (scores, other))
@@ -160,7 +219,11 @@ def against(labels: Labels, scores: Scores, other: Scores, name: str, draws: Arr
 
 
 def by_top1(rows: dict[str, Any]) -> list[str]:
-    """The names of the rows that are models, those with the highest top-1 first; rows: what `describe` says."""
+    """Names of the rows that are models, those with the highest top-1 first.
+
+    Args:
+        rows: Rows by name, as of `describe`.
+    """
     models = [name for name in rows if name not in (GM, COIN)]
     return sorted(models, key=lambda name: -rows[name]["figures"]["top1"]["value"])
 
@@ -168,10 +231,16 @@ def by_top1(rows: dict[str, Any]) -> list[str]:
 def gains(
     right: NDArray[np.bool_], other_right: NDArray[np.bool_], scene: NDArray[np.int64], draws: Array
 ) -> dict[str, Any]:
-    """What a row gains over another on the same cases, with intervals over the same draws.
+    """Gains of a row over another on the same cases, with intervals over the same draws.
 
-    right, other_right, scene: (case,). difference: of the rates at which they are right. failures_removed: the share of
-    the other's failures that are gone, less those that are new; negative where there are more.
+    difference: of the rates at which they are right. failures_removed: the share of the other's failures that are
+    gone, less those that are new; negative if there are more.
+
+    Args:
+        right: Whether the row is right, (case,).
+        other_right: Whether the other is, (case,).
+        scene: Scene of each case, (case,).
+        draws: As of `draw_scenes`.
     """
     columns = (right * 1.0 - other_right, np.ones(len(right)), ~other_right)
     gained, cases, failures = (np.bincount(scene, column, draws.shape[1]) for column in columns)
@@ -184,7 +253,10 @@ def gains(
 def cross_table(right: NDArray[np.bool_], other_right: NDArray[np.bool_], name: str) -> dict[str, Any]:
     """The four cells, and McNemar's exact p: of a split at least as uneven among the cases in which they differ.
 
-    name: of the other.
+    Args:
+        right: Whether the row is right, (case,).
+        other_right: Whether the other is, (case,).
+        name: Name of the other.
     """
     alone, other_alone = int((right & ~other_right).sum()), int((~right & other_right).sum())
     differ = alone + other_alone
@@ -210,7 +282,11 @@ def _of_category(name: str, labels: Labels, scores: Scores) -> dict[str, Any]:
 
 
 def with_interval(values: Array) -> dict[str, Any]:
-    """A figure and its 95 % interval, of (1 + draw,) values the first and those of the rest that are defined."""
+    """A figure and its 95 % interval.
+
+    Args:
+        values: The figure, then its value in each draw, (1 + draw,).
+    """
     value, replicates = values[0], values[1:]
     known = replicates[np.isfinite(replicates)]
     interval = [_plain(x) for x in np.percentile(known, [2.5, 97.5])] if len(known) else None

@@ -1,4 +1,4 @@
-"""What a model makes of an image and of grasps: feature maps (thesis, Fig. 3.5) and principal components (Fig. 3.6)."""
+"""Features inside a model: maps of an image (thesis, Fig. 3.5) and principal components of grasps (Fig. 3.6)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from dexzoo.camera import colourise
 from dexzoo.comparison.charts import save
-from dexzoo.comparison.scores import encoded_views, first_image
-from dexzoo.data.datamodule import GraspDataModule, GraspDataset
-from dexzoo.grasp import GRASP_TYPES, TYPE
-from dexzoo.models.encoders import GraspVector
+from dexzoo.comparison.scores import encoded_views, first_image, one_view
+from dexzoo.data.batches import GraspDataset
+from dexzoo.data.datamodule import GraspDataModule
+from dexzoo.grasp import GRASP_TYPES, Trajectory
+from dexzoo.models.encoders import GraspVector, colorize
 from dexzoo.models.evaluator import GraspEvaluator
 
 NUM_GRASPS = 1000
@@ -27,7 +27,17 @@ _COLUMNS = 5
 
 
 def draw_inside(models: Mapping[str, GraspEvaluator], data: GraspDataModule, split: str, folder: Path) -> list[Path]:
-    """Write NAME_maps.png and NAME_grasps.png, each for the models that have what it shows; returns their paths."""
+    """Write NAME_maps.png and NAME_grasps.png, each for the models that have such maps or features.
+
+    Args:
+        models: Models by name.
+        data: The grasp set.
+        split: Split that is shown.
+        folder: Folder to write to.
+
+    Returns:
+        Their paths.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     image, drawn = first_image(data, split), []
     for name, model in models.items():
@@ -47,7 +57,15 @@ def draw_inside(models: Mapping[str, GraspEvaluator], data: GraspDataModule, spl
 
 @torch.no_grad()
 def feature_maps(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"]) -> Float[Tensor, "channel h w"] | None:
-    """The last feature maps that a module of the model gives while it encodes an image; None where none does."""
+    """The last feature maps that a module of the model gives while it encodes an image.
+
+    Args:
+        model: The model.
+        image: Image of one view.
+
+    Returns:
+        The maps; None if no module gives any.
+    """
     with _recorded(list(model.modules())) as outputs:
         model.encode(image.to(model.device))
     maps = [output for output in outputs if output.ndim == 4 and min(output.shape[2:]) > 1]
@@ -58,21 +76,28 @@ def feature_maps(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"]) -> 
 def grasp_features(
     model: GraspEvaluator, dataset: GraspDataset
 ) -> tuple[Tensor, Float[Tensor, "grasp feature"]] | None:
-    """What a model makes of about a thousand grasps: their rows, and the features.
+    """Features of about a thousand grasps.
 
-    Features are the output of the module `hand_branch`, or, in a model without, what its last linear layer is given,
-    where grasp and image are already joined. None where grasps pass neither, as in an ensemble, whose members are no
-    modules of its own.
+    They are the output of the module `hand_branch`, or, in a model without, the input of its last linear layer,
+    where grasp and image are already joined.
+
+    Args:
+        model: The model.
+        dataset: The grasps.
+
+    Returns:
+        Rows of the grasps, and their features; None if grasps pass neither, as in an ensemble, whose members are
+            no modules of its own.
     """
     branch = dict(model.named_modules()).get(BRANCH)
     linear: list[nn.Module] = [module for module in model.modules() if isinstance(module, nn.Linear)]
     rows, features = [], []
     step = max(1, len(dataset) // NUM_GRASPS)
     with _recorded([branch] if branch else linear, inputs=branch is None) as recorded:
-        for i, (part, scene) in enumerate(encoded_views(model, dataset)):
+        for i, (part, encoding) in enumerate(encoded_views(model, dataset)):
             if i % step == 0:
                 recorded.clear()
-                model.logit(scene, dataset.aimed(part)[None].to(model.device))
+                model.logit(encoding, one_view(dataset.aimed(part).to(model.device)))
                 if not recorded:
                     return None
                 rows.append(part)
@@ -81,8 +106,13 @@ def grasp_features(
 
 
 def maps_picture(image: Float[Tensor, "1 2 224 224"], maps: Float[Tensor, "channel h w"]) -> Figure:
-    """The image's three channels, and the maps that vary most over it."""
-    channels = dict(zip(("depth", "mean curvature", "Gaussian curvature"), colourise(image[:, 0])[0], strict=True))
+    """The image's three channels, and the maps that vary most over it.
+
+    Args:
+        image: Image of one view.
+        maps: Feature maps of it.
+    """
+    channels = dict(zip(("depth", "mean curvature", "Gaussian curvature"), colorize(image[:, 0])[0], strict=True))
     shown = maps.flatten(1).std(1).argsort(descending=True, stable=True)[: 4 * _COLUMNS - len(channels)]
     panels = channels | {f"channel {int(i)}": maps[i] for i in shown}
     figure = Figure((2 * _COLUMNS, 8.6), layout="constrained")
@@ -99,21 +129,28 @@ def maps_picture(image: Float[Tensor, "1 2 224 224"], maps: Float[Tensor, "chann
 
 
 def components_picture(
-    grasps: Float[Tensor, "grasp 10 28"], features: Float[Tensor, "grasp feature"], held: Tensor, where: str
+    grasps: Trajectory, features: Float[Tensor, "grasp feature"], held: Tensor, where: str
 ) -> Figure:
-    """First two principal components of grasps as 280 numbers and as a model's features, by outcome and by type."""
+    """First two principal components of grasps as 280 numbers and as a model's features, by outcome and by type.
+
+    Args:
+        grasps: The grasps.
+        features: Their features.
+        held: Whether each held, (grasp,).
+        where: Title of the features.
+    """
     vectors = GraspVector.flatten(grasps)
     spaces = {"as 280 numbers": principal_components(vectors), where: principal_components(features)}
-    kind = grasps[:, 0, TYPE].round().long()
-    colourings = (
+    kind = grasps.grasp_type
+    colorings = (
         {name: held == value for name, value in (("fails", False), ("holds", True))},
         {GRASP_TYPES[int(value)]: kind == value for value in kind.unique()},
     )
     figure = Figure((9.5, 8), layout="constrained")
-    for i, colouring in enumerate(colourings):
+    for i, coloring in enumerate(colorings):
         for j, (title, points) in enumerate(spaces.items()):
             axes = figure.add_subplot(2, 2, 1 + 2 * i + j)
-            for label, chosen in colouring.items():
+            for label, chosen in coloring.items():
                 x, y = points[chosen].numpy().T
                 axes.scatter(x, y, s=7, alpha=0.6, linewidth=0, label=label)
             axes.set(xticks=[], yticks=[], title=title)
@@ -123,7 +160,11 @@ def components_picture(
 
 
 def principal_components(values: Float[Tensor, "row column"]) -> Float[Tensor, "row 2"]:
-    """The first two principal components of standardised columns; a column that does not vary counts for nothing."""
+    """The first two principal components of standardized columns; a column that does not vary counts for nothing.
+
+    Args:
+        values: Values.
+    """
     values = values.double()
     spread = values.std(0)
     values = (values - values.mean(0)) / torch.where(spread > 1e-6, spread, torch.inf)

@@ -48,36 +48,39 @@ _COST = {
     "parameters": "parameters",
     "megabytes": "MB",
     "trunk_megabytes": "MB of its trunk",
-    "milliseconds_per_view": "ms a view",
-    "milliseconds_per_1000_grasps": "ms for 1,000 grasps",
+    "milliseconds_per_view": "ms per view",
+    "milliseconds_per_1000_grasps": "ms per 1,000 grasps",
     "threads": "threads",
     "processor": "processor",
 }
 _MILLISECONDS = ("milliseconds_per_view", "milliseconds_per_1000_grasps")
 NOTES = """\
-Accuracy, balanced accuracy (the mean of the rates at which successes and failures are recognised) and success of the
-first and of the five first grasps of each scene in %; AUROC over all grasps and, averaged, within scenes; average
-precision; Brier score and expected calibration error, the lower the better. 95 % intervals are bootstrap over scenes,
-several of which show one object; over objects they would be somewhat wider, and p larger. p: McNemar's exact test of
-top-1 against gm, the generator's own order, whose threshold, where it has one, was chosen on validation. The best of
-each column is bold.
+Accuracy, balanced accuracy (mean of the true positive and the true negative rate) and the success rates of the first
+grasp (top-1) and of the first five grasps (top-5) of each scene are in %. AUROC is over all grasps; "in scenes" is
+the AUROC within scenes, averaged. AP is the average precision. For the Brier score and the expected calibration
+error, lower is better. Intervals are 95 % bootstrap over scenes. Several scenes show the same object; over objects,
+intervals would be somewhat wider and p larger. p is McNemar's exact test of top-1 against gm, the generator's own
+order. The threshold of gm, if it has one, was chosen on validation. The best value of each column is bold.
 """
 AGAINST_EM2 = """\
-What each gains over em2 on the same grasps: points of accuracy and of top-1, and how many % of em2's failures in top-1
-it removes, less those that it adds. Then in how many scenes whose first grasp holds, and McNemar's exact p.
+Gain of each row over em2 on the same grasps: percentage points of accuracy and of top-1, and the share of em2's top-1
+failures that it removes, less those that it adds, in %. Then the cross table of scenes by the success of the first
+grasp, and McNemar's exact p.
 """
 
 
 CATEGORIES = """\
-By category, the most difficult last: accuracy, and in how many % of the scenes the first grasp holds; the latter alone
-where a row predicts no outcome.
+By category, the most difficult last: accuracy, and the share of scenes in which the first grasp holds, in %. A row
+without predicted outcomes has only the latter.
 """
 
 
 def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
     """The figures of one source, the best of each column between asterisks.
 
-    brief: only those that fit into a terminal, without intervals.
+    Args:
+        section: Entry of `sources`, as of `compare`.
+        brief: Whether only those are shown that fit into a terminal, without intervals.
     """
     rows: dict[str, Any] = section["rows"]
     columns = {name: column for name, column in _COLUMNS.items() if not brief or name in _BRIEF}
@@ -98,7 +101,11 @@ def main_table(section: dict[str, Any], brief: bool = False) -> Cells:
 
 
 def terminal_table(result: dict[str, Any]) -> Table:
-    """The main table of the first source, the generated grasps, and `advice`, for a terminal of 80 columns."""
+    """The main table of the first source, the generated grasps, and `advice`, for a terminal of 80 columns.
+
+    Args:
+        result: As of `compare`.
+    """
     source, section = next(iter(result["sources"].items()))
     head, rows = main_table(section, brief=True)
     shown = Table(*head, title=title(source, section), box=box.SIMPLE, caption=advice(result), caption_justify="left")
@@ -108,10 +115,15 @@ def terminal_table(result: dict[str, Any]) -> Table:
 
 
 def advice(result: dict[str, Any]) -> str:
-    """One sentence on the first source: which model to use and why, or how a model alone does against gm.
+    """One sentence on the first source: which model to use and why, or how a single model compares with gm.
 
-    It is the model with the highest top-1 or, where its lead over the next may be chance, the quicker of the two. Empty
-    where there is nothing to compare.
+    It is the model with the highest top-1 or, if its lead over the next is not significant, the faster of the two.
+
+    Args:
+        result: As of `compare`.
+
+    Returns:
+        The sentence; empty if there is nothing to compare.
     """
     rows, cost = next(iter(result["sources"].values()))["rows"], result["cost"]
     models = by_top1(rows)
@@ -123,25 +135,29 @@ def advice(result: dict[str, Any]) -> str:
     why = (
         f"{best}'s first grasp holds in {100 * rows[best]['figures']['top1']['value']:.1f} % of the scenes, "
         f"{abs(lead):.1f} points {'less' if lead < 0 else 'more'} than {other}'s (only {best}'s in "
-        f"{cross['only_this']:,} scenes, only {other}'s in {cross[f'only_{other}']:,}), which "
-        f"{'is beyond chance' if sure else 'may be chance'} (p {_p(cross)})"
+        f"{cross['only_this']:,} scenes, only {other}'s in {cross[f'only_{other}']:,}); the difference is "
+        f"{'significant' if sure else 'not significant'} (p {_p(cross)})"
     )
     if other == GM:
         return f"{why}."
     alone = rows[best].get("against_gm", {}).get("top1")
     doubt = ""
     if alone and not (alone["p"] < 0.05 and alone["difference"]["value"] > 0):
-        doubt = f" That {best}'s order is better than gm's, the generator's own, may be chance (p {_p(alone)})."
+        doubt = f" {best} is not significantly better than gm, the generator's own order (p {_p(alone)})."
     if sure:
         return f"Use {best}: {why}.{doubt}"
     time = {name: sum(cost[name][part] for part in _MILLISECONDS) for name in (best, other)}
     quick, slow = sorted(time, key=time.__getitem__)
-    spent = f"{time[quick]:,.0f} ms for a view and 1,000 grasps against {time[slow]:,.0f}"
-    return f"Use {quick}: {why}, and {quick} is the quicker, {spent}.{doubt}"
+    spent = f"{time[quick]:,.0f} ms for a view and 1,000 grasps, against {time[slow]:,.0f}"
+    return f"Use {quick}: {why}, and {quick} is faster ({spent}).{doubt}"
 
 
 def counts_table(section: dict[str, Any]) -> Cells:
-    """True and false positives and negatives (thesis, Table 3.3), and the cross table of top-1 with gm (Table 3.4)."""
+    """True and false positives and negatives (thesis, Table 3.3), and the cross table of top-1 with gm (Table 3.4).
+
+    Args:
+        section: Entry of `sources`, as of `compare`.
+    """
     names = _cross(GM)
     found = Cells(["", *_COUNTS, *names.values()], [])
     for label, row in section["rows"].items():
@@ -152,7 +168,11 @@ def counts_table(section: dict[str, Any]) -> Cells:
 
 
 def against_em2(section: dict[str, Any]) -> list[str]:
-    """What each row gains over em2 and the cross table of top-1, in Markdown; nothing where em2 is not compared."""
+    """Gains of each row over em2 and the cross table of top-1, in Markdown; empty if em2 is not compared.
+
+    Args:
+        section: Entry of `sources`, as of `compare`.
+    """
     names = _cross(EM2)
     rows = []
     for label, row in section["rows"].items():
@@ -165,16 +185,26 @@ def against_em2(section: dict[str, Any]) -> list[str]:
 
 
 def cost_table(cost: dict[str, dict[str, Any]]) -> Cells:
-    """Size and speed of the models."""
+    """Size and speed of the models.
 
-    def told(value: object) -> str:
+    Args:
+        cost: Entry `cost`, as of `compare`.
+    """
+
+    def formatted(value: object) -> str:
         return f"{value:,}" if isinstance(value, int | float) else str(value)
 
-    return Cells(["", *_COST.values()], [[label, *(told(row[name]) for name in _COST)] for label, row in cost.items()])
+    return Cells(
+        ["", *_COST.values()], [[label, *(formatted(row[name]) for name in _COST)] for label, row in cost.items()]
+    )
 
 
 def category_table(section: dict[str, Any]) -> Cells:
-    """Accuracy, and in how many % of the scenes the first grasp holds, by category, the most difficult last."""
+    """Accuracy, and in how many % of the scenes the first grasp holds, by category, the most difficult last.
+
+    Args:
+        section: Entry of `sources`, as of `compare`.
+    """
     rows = section["rows"]
     categories = next(iter(rows.values()))["by_category"]
     found = Cells(["category", "scenes", "grasps", "hold", *rows], [])
@@ -189,7 +219,12 @@ def category_table(section: dict[str, Any]) -> Cells:
 
 
 def title(source: str, section: dict[str, Any]) -> str:
-    """What a table is about."""
+    """Title of a table.
+
+    Args:
+        source: Source of the grasps.
+        section: Entry of `sources`, as of `compare`.
+    """
     return (
         f"{section['grasps']:,} {source} grasps of {section['objects']} objects in {section['scenes']:,} scenes, "
         f"{100 * section['success_rate']:.1f} % hold"
@@ -197,7 +232,11 @@ def title(source: str, section: dict[str, Any]) -> str:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The whole comparison: `advice`, for each source its tables, then the cost."""
+    """The whole comparison: `advice`, for each source its tables, then the cost.
+
+    Args:
+        result: As of `compare`.
+    """
     parts = [f"# Comparison on the {result['split']} split\n", f"{advice(result)}\n", NOTES]
     for source, section in result["sources"].items():
         parts += [f"## {title(source, section)}\n", table(*main_table(section)), table(*counts_table(section))]
@@ -207,7 +246,12 @@ def markdown(result: dict[str, Any]) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table in Markdown."""
+    """A table in Markdown.
+
+    Args:
+        head: Headings.
+        rows: Cells of each row.
+    """
     first, *others = (f"| {' | '.join(map(str, row))} |" for row in (head, *rows))
     return "\n".join([first, "|" + "---|" * len(head), *others]) + "\n"
 
@@ -215,7 +259,10 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 def write(result: dict[str, Any], folder: Path, pictures: Iterable[Path] = ()) -> None:
     """Write comparison.md, comparison.json and the charts into a folder.
 
-    pictures: that are there already, to be shown in comparison.md after the charts.
+    Args:
+        result: As of `compare`.
+        folder: Folder to write to.
+        pictures: Pictures that are there already, to be shown in comparison.md after the charts.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shown = [f"![{path.stem}]({path.name})\n" for path in (*draw_charts(result, folder), *pictures)]

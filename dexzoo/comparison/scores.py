@@ -16,26 +16,33 @@ from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
 
-from dexzoo.data.datamodule import GraspDataModule, GraspDataset
+from dexzoo.data.batches import GraspDataset
+from dexzoo.data.datamodule import GraspDataModule
 from dexzoo.data.schema import SPLITS
+from dexzoo.grasp import Trajectory
+from dexzoo.models.batch import Encoding
 from dexzoo.models.encoders import DepthEncoder, fast_bfloat16
-from dexzoo.models.evaluator import CHUNK, GraspEvaluator, Scene
+from dexzoo.models.evaluator import CHUNK, GraspEvaluator
 from dexzoo.models.trunks import trunk_bytes
 
 GM, COIN = "gm", "coin"
 """The rows that every comparison has: the generative model, ranking by its own likelihood, and chance."""
 EM2 = "em2"
-"""The thesis' evaluator, which the other rows are set against where it is compared."""
+"""The thesis' evaluator, a reference for the other rows."""
 NUM_TIMED = 1000
 _REPEATS = 3
 
 
 @dataclass(frozen=True)
 class Labels:
-    """Grasps of one source, and what became of them.
+    """Grasps of one source and their outcomes.
 
-    success: (grasp,) whether each held. scene: (grasp,) from 0, without gaps. objects, category: (scene,) names.
-    log_likelihood: (grasp,) the generator's, nan where it is not known.
+    Attributes:
+        success: Whether each held, (grasp,).
+        scene: Scene of each, from 0, without gaps, (grasp,).
+        objects: Names of the objects, (scene,).
+        category: Their categories, (scene,).
+        log_likelihood: The generator's, nan if it is not known, (grasp,).
     """
 
     success: NDArray[np.bool_]
@@ -58,10 +65,12 @@ class Labels:
 
 @dataclass(frozen=True)
 class Scores:
-    """What one row says of the grasps.
+    """Scores of one row.
 
-    score: (grasp,) what ranks them, best highest. probability: (grasp,) of success; None where it gives none.
-    threshold: the probability, or else the score, above which a grasp is predicted to hold; None if none was chosen.
+    Attributes:
+        score: Score that ranks the grasps, best highest, (grasp,).
+        threshold: Probability, or else score, above which a grasp is predicted to hold; None if none was chosen.
+        probability: Probability of success, (grasp,); None if the row gives none.
     """
 
     score: NDArray[np.float32]
@@ -82,14 +91,17 @@ class Scores:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a model takes.
+    """Size and speed of a model; an ensemble's members count in all.
 
-    parameters: those trained. megabytes: of the file that it was read from, or else that `save` would write, without
-    the frozen trunk, which models share. trunk_megabytes: of the trunk as dexzoo keeps it, or else in memory; 0 without
-    one. An ensemble's members count in all.
-    milliseconds_per_view, milliseconds_per_1000_grasps: best of three on `threads` threads; the view is encoded by the
-    trunk and all, the grasps are scored on one view. processor: whose they are, and whether it has instructions for
-    bfloat16.
+    Attributes:
+        parameters: Number of trained parameters.
+        megabytes: Size of the file that it was read from, or else that `save` would write, without the frozen
+            trunk, which models share.
+        trunk_megabytes: Size of the trunk as dexzoo keeps it, or else in memory; 0 without one.
+        milliseconds_per_view: Time to encode a view, trunk included; best of three.
+        milliseconds_per_1000_grasps: Time to score 1,000 grasps on one view; best of three.
+        threads: Number of threads.
+        processor: Name of the processor, and whether it is fast in bfloat16.
     """
 
     parameters: int
@@ -102,7 +114,16 @@ class Cost:
 
 
 def read_labels(data: GraspDataModule, split: str, source: str) -> Labels | None:
-    """The grasps of a split from one source, in the order of `data.dataset`; None where there are none."""
+    """The grasps of a split from one source, in the order of `data.dataset`.
+
+    Args:
+        data: The grasp set.
+        split: The split.
+        source: The source.
+
+    Returns:
+        The grasps; None if there are none.
+    """
     grasp_set, rows = data.source, data.rows(split, [source]).numpy()
     if not len(rows):
         return None
@@ -113,13 +134,26 @@ def read_labels(data: GraspDataModule, split: str, source: str) -> Labels | None
 
 
 def first_image(data: GraspDataModule, split: str) -> Float[Tensor, "1 2 224 224"]:
-    """What evaluators see of the first view of a split."""
+    """Image of the first view of a split.
+
+    Args:
+        data: The grasp set.
+        split: The split.
+    """
     row = int(data.source.grasp_view[data.source.grasp_split == SPLITS.index(split)].min())
     return data.source.images([row])[torch.tensor([0])]
 
 
-def encoded_views(model: GraspEvaluator, dataset: GraspDataset) -> Iterator[tuple[Tensor, Scene]]:
-    """For each view of a dataset the rows of its grasps, and what the model keeps of it, encoded once."""
+def encoded_views(model: GraspEvaluator, dataset: GraspDataset) -> Iterator[tuple[Tensor, Encoding]]:
+    """Encode each view of a dataset once.
+
+    Args:
+        model: The model.
+        dataset: The grasps.
+
+    Returns:
+        For each view the rows of its grasps, and its encoding.
+    """
     order = dataset.view.argsort(stable=True)
     views, count = dataset.view[order].unique_consecutive(return_counts=True)
     for view, rows in zip(views.split(1), order.split(count.tolist()), strict=True):
@@ -129,27 +163,52 @@ def encoded_views(model: GraspEvaluator, dataset: GraspDataset) -> Iterator[tupl
             yield rows, model.encode(dataset.views[view].to(model.device))
 
 
+def one_view(grasps: Trajectory) -> Trajectory:
+    """Grasps of one view as `GraspEvaluator.logit` takes them.
+
+    Args:
+        grasps: Trajectories, (grasp,).
+
+    Returns:
+        Trajectories, (1, grasp).
+    """
+    return Trajectory.stack([grasps])
+
+
 @torch.no_grad()
 def model_scores(model: GraspEvaluator, dataset: GraspDataset, title: str) -> Scores:
     """Log-odds and probabilities of a model on each grasp, without dropout, in the view that the set pairs it with.
 
-    title: of the progress bar. ValueError for a model that gives nan.
+    Args:
+        model: The model.
+        dataset: The grasps.
+        title: Title of the progress bar.
+
+    Raises:
+        ValueError: The model gives scores that are nan or infinite.
     """
     logit = torch.zeros(len(dataset))
     views = encoded_views(model, dataset)
     num_views = len(dataset.view.unique())
     with model.without_dropout():
-        for rows, scene in track(views, title, num_views, transient=True, disable=not sys.stderr.isatty()):
-            logit[rows] = model.logit(scene, dataset.aimed(rows)[None].to(model.device))[0].float().cpu()
+        for rows, encoding in track(views, title, num_views, transient=True, disable=not sys.stderr.isatty()):
+            logit[rows] = model.logit(encoding, one_view(dataset.aimed(rows).to(model.device)))[0].float().cpu()
     if wrong := int((~logit.isfinite()).sum()):
         raise ValueError(f"{title}: {wrong} of {len(logit)} scores are nan or infinite; the weights are of no use")
     return Scores(logit.numpy(), 0.5, model.probability(logit).numpy())
 
 
 def likelihood_scores(labels: Labels, validation: Labels | None) -> Scores | None:
-    """The generator's log-likelihood, with the threshold that is most accurate on validation grasps; None if unknown.
+    """The generator's log-likelihood, with the threshold that is most accurate on validation grasps.
 
     A likelihood is no probability of success, so it has no calibration.
+
+    Args:
+        labels: The grasps.
+        validation: Validation grasps, if there are some.
+
+    Returns:
+        The scores; None if likelihoods are not known.
     """
     if np.isnan(labels.log_likelihood).any():
         return None
@@ -160,13 +219,23 @@ def likelihood_scores(labels: Labels, validation: Labels | None) -> Scores | Non
 
 
 def coin_scores(labels: Labels, seed: int) -> Scores:
-    """A probability drawn for each grasp, uniformly."""
+    """A probability drawn for each grasp, uniformly.
+
+    Args:
+        labels: The grasps.
+        seed: Seed of the coin.
+    """
     probability = np.random.default_rng(seed).random(len(labels.success), np.float32)
     return Scores(probability, 0.5, probability)
 
 
 def best_threshold(score: NDArray[np.float32], success: NDArray[np.bool_]) -> float:
-    """The threshold above which calling a grasp a success is right most often; the lowest of equals."""
+    """The most accurate threshold; the lowest of equals.
+
+    Args:
+        score: Scores, (grasp,).
+        success: Whether each held, (grasp,).
+    """
     value, place = np.unique(score, return_inverse=True)
     held, failed = (np.bincount(place, kind, minlength=len(value)) for kind in (success, ~success))
     # a threshold below all values gets every success right; each value that it rises to trades successes for failures
@@ -176,14 +245,20 @@ def best_threshold(score: NDArray[np.float32], success: NDArray[np.bool_]) -> fl
 
 
 @torch.no_grad()
-def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: Float[Tensor, "grasp 10 28"]) -> Cost:
-    """Size of a model, and its speed on one view and some grasps, which are repeated up to 1,000."""
+def measure(model: GraspEvaluator, image: Float[Tensor, "1 2 224 224"], grasps: Trajectory) -> Cost:
+    """Size of a model, and its speed on one view and some grasps, which are repeated up to 1,000.
+
+    Args:
+        model: The model.
+        image: Image of one view.
+        grasps: Grasps, in the frame of its aimed camera.
+    """
     image = image.to(model.device)
     grasps = grasps[torch.arange(NUM_TIMED) % len(grasps)].to(model.device)
     with model.without_dropout():
-        scene = model.encode(image)
+        encoding = model.encode(image)
         view = _best_time(lambda: model.encode(image))
-        scoring = _best_time(lambda: [model.logit(scene, part[None]) for part in grasps.split(CHUNK)])
+        scoring = _best_time(lambda: [model.logit(encoding, one_view(part)) for part in grasps.split(CHUNK)])
     with tempfile.TemporaryDirectory() as folder:
         size = sum(part.num_bytes or part.save(folder).stat().st_size for part in model.parts)
     trunks = {layer.name for part in model.parts for layer in part.modules() if isinstance(layer, DepthEncoder)}

@@ -1,1 +1,1 @@
-"""Grasp sets: how they lie on disk, how they are made, how they become batches."""
+"""Grasp sets: their format on disk, reading and writing, and batches for training. No simulator."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import numpy as np
@@ -21,11 +22,8 @@ from numpy.typing import NDArray
 from rich.progress import track
 from torch import Tensor
 
-from dexzoo.camera import Camera, Observation
-from dexzoo.data.rendering import render
 from dexzoo.data.schema import (
     DEPTH_UNIT,
-    PATH_SIZE,
     SCHEMAS,
     SPLITS,
     VERSION,
@@ -35,8 +33,12 @@ from dexzoo.data.schema import (
 )
 from dexzoo.data.writer import MANIFEST, read_manifest
 from dexzoo.grasp import Grasps
-from dexzoo.hand import default_hand
+from dexzoo.hand import Hand, HandSpec
+from dexzoo.perception.camera import Camera
+from dexzoo.perception.observation import Observation
 
+Renderer = Callable[[dict[str, Any], list[int], Path], list[bytes]]
+"""Gives the depth PNGs of views: row of the table of scenes, seeds of the views, cache folder."""
 _READERS = 8
 _VIEWS = 1000  # more than a scene has
 
@@ -44,24 +46,41 @@ _VIEWS = 1000  # more than a scene has
 class GraspSet:
     """A grasp set read into memory.
 
-    address: a folder, or s3://..., hf://... and the like, with the package that fsspec asks for.
-    cache: folder for views without images once they are rendered; by default in the user's cache folder.
+    Args:
+        address: A folder, or s3://..., hf://... and the like, with the package that fsspec asks for.
+        cache: Folder for views without images once they are rendered; by default in the user's cache folder.
+        renderer: Renders views that the set keeps no image of, such as `dexzoo.collection.rendering.render`; without
+            it, asking for such a view is an error.
 
-    scenes, views, grasps: pyarrow tables, as `dexzoo.data.schema` says; scenes that were skipped are left out.
-    sha256: of all that was read.
-    grasp_scene, grasp_view: (num_grasps,) rows in `scenes` and `views` of the scene and of the view it is paired with.
-    grasp_split: (num_grasps,) index into SPLITS. view_scene: (num_views,) row in `scenes`.
-    success: (num_grasps,) bool. source: (num_grasps,) strings.
+    Attributes:
+        scenes: Table of scenes, as `dexzoo.data.schema` says; scenes that were skipped are left out.
+        views: Table of views.
+        grasps: Table of grasps.
+        hand: The hand of the grasps.
+        sha256: Checksum of all that was read.
+        grasp_scene: Row in `scenes` of each grasp's scene, (grasp,).
+        grasp_view: Row in `views` of the view that each grasp is paired with, (grasp,).
+        grasp_split: Index into `SPLITS`, (grasp,).
+        view_scene: Row in `scenes` of each view's scene, (view,).
+        success: Whether each grasp held, (grasp,).
+        source: Where each grasp comes from, (grasp,).
 
-    Raises FileNotFoundError, ValueError or RuntimeError that names the file at fault.
+    Raises:
+        FileNotFoundError: A file is missing.
+        ValueError: A file is damaged, or the set is of a hand that is not in robots/.
+        RuntimeError: The address cannot be reached.
     """
 
-    def __init__(self, address: str | Path, cache: Path | None = None) -> None:
+    def __init__(self, address: str | Path, cache: Path | None = None, renderer: Renderer | None = None) -> None:
         self.address = str(address)
         self.cache = (cache or user_cache()) / "renders"
+        self.renderer = renderer
         files = _Files(self.address)
         scenes, self.views, self.grasps = (files.read(name) for name in ("scenes", "views", "grasps"))
         self.sha256 = files.digest.hexdigest()
+        if files.hand not in HandSpec.known():
+            raise ValueError(f"{self.address} is of a hand {files.hand!r}, which is not in robots/")
+        self.hand = Hand.load(files.hand)
         self.scenes = scenes.filter(pc.is_null(scenes["skipped"]))
         number = _column(self.scenes, "scene")
         self.view_scene = _find(number, _column(self.views, "scene"), f"{self.address}/views name scene")
@@ -82,15 +101,15 @@ class GraspSet:
     def paths(self) -> NDArray[np.float32]:
         """(num_grasps, 66) column path."""
         flat = self.grasps["path"].combine_chunks().flatten().to_numpy()
-        return np.array(flat, np.float32).reshape(-1, PATH_SIZE)
+        return np.array(flat, np.float32).reshape(len(self.grasps), -1)
 
     @cached_property
     def world_grasps(self) -> Grasps:
-        """All grasps in the world frame, in the order of the table; log_likelihood is NaN where it is not known."""
+        """All grasps in the world frame, in the order of the table; log_likelihood is NaN if unknown."""
         types = torch.tensor(self.grasps["grasp_type"].to_numpy())
-        grasps = decode_path(self.paths, types, default_hand())
+        grasps = decode_path(self.paths, types, self.hand)
         likelihood = torch.tensor(np.asarray(self.grasps["log_likelihood"].to_numpy(), np.float32))
-        return Grasps(grasps.waypoints, "world", likelihood)
+        return Grasps.of(grasps.trajectory, self.hand, likelihood)
 
     @cached_property
     def camera_poses(self) -> Float[Tensor, "view 4 4"]:
@@ -103,7 +122,14 @@ class GraspSet:
         return torch.tensor(_lists(self.views, "table", 4), dtype=torch.float32)
 
     def depth(self, views: Sequence[int]) -> list[bytes]:
-        """The 16-bit PNGs of some rows of `views`, rendered where the set keeps none."""
+        """The depth of some views as 16-bit PNGs, rendered if the set keeps none.
+
+        Args:
+            views: Rows of `views`.
+
+        Raises:
+            ValueError: A view has neither depth nor seed, or must be rendered and there is no renderer.
+        """
         known = self.views["depth"].take(pa.array(views, pa.int64())).to_pylist()
         missing = np.array([view for view, png in zip(views, known, strict=True) if png is None], np.int64)
         rendered: dict[int, bytes] = {}
@@ -114,24 +140,36 @@ class GraspSet:
             seeds = self.views["seed"].take(pa.array(rows)).to_pylist()
             if None in seeds:
                 raise ValueError(f"{self.address}/views has neither depth nor seed for scene {scene}")
-            images = render(self.scenes.slice(scene, 1).to_pylist()[0], seeds, self.cache)
+            if self.renderer is None:
+                raise ValueError(f"{self.address} keeps no images; open it with a renderer, see GraspSet")
+            images = self.renderer(self.scenes.slice(scene, 1).to_pylist()[0], seeds, self.cache)
             rendered |= dict(zip(rows.tolist(), images, strict=True))
         return [rendered[view] if png is None else png for view, png in zip(views, known, strict=True)]
 
     def observation(self, view: int) -> Observation:
-        """The aimed observation of a row of `views`."""
+        """The aimed observation of a view.
+
+        Args:
+            view: Row of `views`.
+        """
         return decode_view(self.views.slice(view, 1).to_pylist()[0], self.depth([view])[0])
 
     def images(self, views: Sequence[int]) -> ViewImages:
-        """The images of some rows of `views`, held ready."""
+        """The images of some views, held in memory.
+
+        Args:
+            views: Rows of `views`.
+        """
         depth = [decode_depth(png, f"view {view}") for view, png in zip(views, self.depth(views), strict=True)]
         return ViewImages(torch.from_numpy(np.stack(depth)), self.tables[torch.tensor(views)])
 
 
 class ViewImages:
-    """Depth images of aimed views, made into what evaluators see when they are asked for.
+    """Depth images of aimed views, from which evaluators' images are made on demand.
 
-    depth: (view, 224, 224) uint16 in units of 0.1 mm. table: (view, 4).
+    Args:
+        depth: Depth in units of 0.1 mm, uint16, (view, 224, 224).
+        table: Plane of each view's table.
     """
 
     def __init__(self, depth: Tensor, table: Float[Tensor, "view 4"]) -> None:
@@ -139,7 +177,7 @@ class ViewImages:
         self._rays = torch.tensor(Camera.aimed().directions(), dtype=torch.float32)
 
     def __getitem__(self, views: Tensor) -> Float[Tensor, "view 2 224 224"]:
-        """`Observation.image()` of each: depth and height over the table in metres, 0 where the object is not."""
+        """`Observation.image()` of each: depth and height over the table in meters, 0 where the object is not."""
         depth = self.depth[views].int().float() * DEPTH_UNIT
         normal, offset = self.table[views, :3], self.table[views, 3]
         height = depth * (self._rays @ normal.T).permute(2, 0, 1) + offset[:, None, None]
@@ -147,11 +185,12 @@ class ViewImages:
 
 
 class _Files:
-    """The files of a set, as its manifest names them, or all that are there where it has none."""
+    """The files of a set, as its manifest names them, or all that are there if it has none; and the set's hand."""
 
     def __init__(self, address: str) -> None:
         self.address = address
         self.digest = hashlib.sha256()
+        self.hand = "dlr2"
         try:
             self.system, self.root = fsspec.core.url_to_fs(address)
             self.names = self._list()
@@ -167,13 +206,18 @@ class _Files:
         path = f"{self.root}/{MANIFEST}"
         if self.system.isfile(path):
             manifest = read_manifest(self.system.cat_file(path), f"{self.address}/{MANIFEST}")
+            self.hand = manifest["configuration"].get("hand", self.hand)
             return {name: file["sha256"] for name, file in manifest["files"].items()}
         found = [path for name in SCHEMAS for path in self.system.glob(f"{self.root}/{name}/*.parquet")]
         names = ["/".join(path.split("/")[-2:]) for path in sorted(found)]
         return {name: None for name in names if "/." not in name}
 
     def read(self, table: str) -> pa.Table:
-        """All files of a table."""
+        """All files of a table.
+
+        Args:
+            table: Name of the table.
+        """
         names = [name for name in self.names if name.startswith(f"{table}/")]
         if not names:
             raise FileNotFoundError(f"grasp set {self.address} has no {table}/*.parquet")
@@ -203,7 +247,7 @@ class _Files:
 
 
 def user_cache() -> Path:
-    """Where what can be made again is kept: $XDG_CACHE_HOME/dexzoo, or ~/.cache/dexzoo."""
+    """Folder of files that can be made again: $XDG_CACHE_HOME/dexzoo, or ~/.cache/dexzoo."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dexzoo"
 
 

@@ -6,16 +6,16 @@ manifest.json: version, configuration, counts, and the checksum of each file.
 
 objects  object (its name), category, split (train, validation or test: by object), mass_min, mass_max (kg).
 scenes   one row for each scene that was tried: scene (number), object, category, split, scale, mass (kg), friction,
-         T_world_object (16 numbers, row by row), support_half (3, metres) and support_yaw (rad) of the block that the
+         T_world_object (16 numbers, row by row), support_half (3, meters) and support_yaw (rad) of the block that the
          object lies on, if any, seed (of the set), trials (behind success_rate), generated and held (how many grasps
          were generated, and how many of them held), skipped (why the scene has no views and grasps, or null).
-views    scene, view (0 is what the generator saw), seed (of the drawn camera and the sensor's noise), T_world_camera
+views    scene, view (the generator saw number 0), seed (of the drawn camera and the sensor's noise), T_world_camera
          (16) of the aimed camera, width, height, fx, fy, cx, cy (pixels), table (4: plane in the camera frame), depth
-         (16-bit PNG of the object's pixels, 0.1 mm a unit, 0 elsewhere; null where it is to be rendered again).
+         (16-bit PNG of the object's pixels, 0.1 mm a unit, 0 elsewhere; null if it is rendered again).
 grasps   scene, view (the one it is paired with, drawn among the scene's), grasp_type (0 to 9), source (generated,
-         perturbed or refined), rank (place in the generator's order from 0; a neighbour has that of the grasp it was
+         perturbed or refined), rank (place in the generator's order from 0; a neighbor has that of the grasp it was
          made from), log_likelihood (null where not generated), path (3 x 22: wrist position, quaternion wxyz and free
-         joints at pre-grasp, grip and squeeze, world frame), and what the trial found, as in `dexzoo.sim.Outcomes`
+         joints at pre-grasp, grip and squeeze, world frame), and the outcome, as in `dexzoo.sim.Outcomes`
          with null for NaN; success_rate is null where the grasp was tried once.
 
 Frames, joint order and units: docstring of `dexzoo.grasp`.
@@ -32,9 +32,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dexzoo.camera import IMAGE_SIZE, Camera, Observation
-from dexzoo.grasp import GRIP, PREGRASP, SQUEEZE, Grasps
+from dexzoo.grasp import KEYFRAMES, Grasps, Trajectory
 from dexzoo.hand import Hand
+from dexzoo.perception.camera import IMAGE_SIZE, Camera
+from dexzoo.perception.observation import Observation
 
 VERSION = "2"
 DEPTH_UNIT = 1e-4
@@ -109,7 +110,11 @@ TABLES = tuple(SCHEMAS)
 
 
 def encode_depth(observation: Observation) -> bytes:
-    """Column depth of an aimed observation: the object's pixels as a 16-bit PNG."""
+    """Encode the column depth: the object's pixels as a 16-bit PNG.
+
+    Args:
+        observation: An aimed observation.
+    """
     depth = np.where(observation.mask, observation.depth, 0)
     done, png = cv2.imencode(".png", np.round(depth / DEPTH_UNIT).astype(np.uint16), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     if not done:
@@ -118,7 +123,18 @@ def encode_depth(observation: Observation) -> bytes:
 
 
 def decode_depth(png: bytes, where: str) -> NDArray[np.uint16]:
-    """(224, 224) depth in units of 0.1 mm; ValueError that says where it stands if it is no such PNG."""
+    """Decode the column depth.
+
+    Args:
+        png: A 16-bit PNG.
+        where: Its place, for errors.
+
+    Returns:
+        Depth in units of 0.1 mm, (224, 224).
+
+    Raises:
+        ValueError: It is no such PNG.
+    """
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) if png else None
     if image is None or image.shape != (IMAGE_SIZE, IMAGE_SIZE) or image.dtype != np.uint16:
         raise ValueError(f"the depth of {where} is no 16-bit PNG of {IMAGE_SIZE} x {IMAGE_SIZE} pixels")
@@ -126,10 +142,15 @@ def decode_depth(png: bytes, where: str) -> NDArray[np.uint16]:
 
 
 def encode_view(observation: Observation, seed: int | None = None, depth: bool = True) -> dict[str, Any]:
-    """The columns of an aimed observation, but for its scene and number.
+    """Encode the columns of an aimed observation, without its scene and number.
 
-    seed: that of `Scene.observe`, from which the view can be rendered again; depth: whether the image is kept.
-    Raises ValueError for an observation that is not aimed.
+    Args:
+        observation: The observation.
+        seed: Seed of `Scene.observe`, from which the view can be rendered again.
+        depth: Whether the image is kept.
+
+    Raises:
+        ValueError: The observation is not aimed.
     """
     camera = observation.camera
     if camera != _AIMED:
@@ -149,7 +170,15 @@ def encode_view(observation: Observation, seed: int | None = None, depth: bool =
 
 
 def decode_view(row: dict[str, Any], png: bytes) -> Observation:
-    """The aimed observation of a row of views and its depth."""
+    """Decode an aimed observation.
+
+    Args:
+        row: Row of the table of views.
+        png: Its depth.
+
+    Raises:
+        ValueError: The camera is not that of an aimed view, or the depth is damaged.
+    """
     where = f"scene {row['scene']}, view {row['view']}"
     camera = Camera.from_dict(row, where)
     if camera != _AIMED:
@@ -159,13 +188,32 @@ def decode_view(row: dict[str, Any], png: bytes) -> Observation:
     return Observation(depth, camera, pose, np.array(row["table"]), mask=depth > 0)
 
 
-def encode_path(grasps: Grasps, hand: Hand) -> NDArray[np.float32]:
-    """(num_grasps, 66) column path of grasps in the world frame."""
-    key = grasps.waypoints[:, [PREGRASP, GRIP, SQUEEZE]]
-    return torch.cat((key[..., :7], hand.reduce(key[..., 7:27])), -1).flatten(1).numpy().astype(np.float32)
+def encode_path(grasps: Grasps) -> NDArray[np.float32]:
+    """Encode grasps as the column path.
+
+    Args:
+        grasps: Grasps in the world frame.
+
+    Returns:
+        Wrist position, quaternion and free joints at the three keyframes, (grasp, 66) for dlr2.
+    """
+    keys = grasps.trajectory.waypoint(KEYFRAMES)
+    numbers = torch.cat((keys.wrist, grasps.hand.reduce(keys.joints)), -1)
+    return numbers.flatten(1).numpy().astype(np.float32)
 
 
 def decode_path(path: NDArray[np.float32], grasp_type: Tensor, hand: Hand) -> Grasps:
-    """The grasps, in the world frame, of a column path (num_grasps, 66)."""
-    key = torch.tensor(path).unflatten(-1, (3, 22))
-    return Grasps.from_keyframes(key[..., :3], key[..., 3:7], hand.expand(key[..., 7:]), grasp_type, "world")
+    """Decode the column path.
+
+    Args:
+        path: The column, (grasp, 66) for dlr2.
+        grasp_type: The column grasp_type, (grasp,).
+        hand: The hand of the set.
+
+    Returns:
+        The grasps in the world frame.
+    """
+    keys = torch.tensor(path).unflatten(-1, (3, 7 + len(hand.freedoms)))
+    joints = hand.expand(keys[..., 7:])
+    motion = Trajectory.from_keyframes(keys[..., :3], keys[..., 3:7], joints, grasp_type.long())
+    return Grasps.of(motion, hand)

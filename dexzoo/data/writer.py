@@ -24,17 +24,24 @@ SHARD_SCENES = 50
 """Scenes of consecutive numbers that share a file."""
 BY_SCENE = ("scenes", "views", "grasps")
 MANIFEST = "manifest.json"
+FIRST_EDITION = {"hand": "dlr2"}
+"""Entries of the configuration that sets of the first edition do not name."""
 _PARTS = ".scenes"  # scenes whose shard is not yet complete; readers of Parquet folders pass over hidden names
 
 SceneRows = dict[str, pa.Table]
-"""What one scene adds to each of the tables scenes (one row), views and grasps."""
+"""Rows of one scene in each of the tables scenes (one row), views and grasps."""
 
 
 def scene_rows(scene: Mapping[str, Any], views: Sequence[Mapping[str, Any]] = (), grasps: Any = None) -> SceneRows:  # noqa: ANN401
     """The rows of a scene in the format's types; columns that are left out are null.
 
-    scene: its row. views: their rows without scene and view, in order. grasps: a mapping of columns without scene.
-    Raises ValueError for a column that the format does not have, or a split that is none of the three.
+    Args:
+        scene: Row of the scene.
+        views: Rows of its views without scene and view, in order.
+        grasps: Mapping of the grasps' columns without scene.
+
+    Raises:
+        ValueError: The format has no such column, or the split is none of the three.
     """
     if scene["split"] not in SPLITS:
         raise ValueError(f"scene {scene['scene']} has the split {scene['split']!r}; use one of {', '.join(SPLITS)}")
@@ -48,7 +55,12 @@ def scene_rows(scene: Mapping[str, Any], views: Sequence[Mapping[str, Any]] = ()
 
 
 def grasp_rows(scene: int, columns: Mapping[str, Any]) -> pa.Table:
-    """Rows of the table of grasps, all of one scene; columns that are left out are null, or there are no rows."""
+    """Rows of the table of grasps, all of one scene; columns that are left out are null.
+
+    Args:
+        scene: Number of the scene.
+        columns: Columns without scene; without any there are no rows.
+    """
     count = len(next(iter(columns.values()))) if columns else 0
     return _table("grasps", {**columns, "scene": [scene] * count})
 
@@ -77,13 +89,20 @@ class GraspSetWriter:
     A scene goes to a folder of its own, whole or not at all; once all scenes of a shard are there, they are gathered
     into one file for each table. The files depend on the scenes alone, not on their order or on interruptions.
 
-    configuration: what the rows are made with; it must be that of what the folder holds already.
-    num_scenes: the set shall hold scenes 0 to num_scenes - 1; it may be larger than it was before.
-    objects: rows of the table of objects.
-    done: numbers of the scenes that are there.
+    Args:
+        folder: Folder of the set.
+        configuration: Configuration of the rows; it must be that of the rows that are there already.
+        num_scenes: The set shall hold scenes 0 to num_scenes - 1; it may be larger than it was before.
+        objects: Rows of the table of objects.
 
-    Raises ValueError for a folder of another configuration or of another program, FileNotFoundError where a file of
-    the manifest is missing, OSError that names the folder where it cannot be written.
+    Attributes:
+        done: Numbers of the scenes that are there.
+
+    Raises:
+        FileNotFoundError: A file of the manifest is missing.
+        ValueError: The folder is of another configuration, or no grasp set.
+        OSError: The folder cannot be written.
+        RuntimeError: Another process is writing to it.
     """
 
     def __init__(
@@ -121,7 +140,11 @@ class GraspSetWriter:
         os.close(self._lock)
 
     def write(self, rows: SceneRows) -> None:
-        """Add one scene; when this returns it is on disk."""
+        """Add one scene; when this returns it is on disk.
+
+        Args:
+            rows: Rows of the scene.
+        """
         scene = int(rows["scenes"]["scene"][0].as_py())
         temporary, final = self._parts / f".{scene:06d}", self._parts / f"{scene:06d}"
         temporary.mkdir()
@@ -158,11 +181,24 @@ class GraspSetWriter:
             shutil.rmtree(path)
 
     def add_grasps(self, part: str, grasps: pa.Table) -> None:
-        """Add grasps of scenes that are there as a file of their own, grasps/PART.parquet, replacing it if there."""
+        """Add grasps of scenes that are there as a file of their own, replacing it if there.
+
+        Args:
+            part: Name of the file, grasps/PART.parquet.
+            grasps: Rows of the table of grasps.
+        """
         self._write_table("grasps", part, grasps.cast(SCHEMAS["grasps"]))
 
     def settle(self, name: str, value: Mapping[str, Any]) -> None:
-        """Add how a part is made to the configuration. ValueError if the same part was begun otherwise."""
+        """Add the settings of a part to the configuration.
+
+        Args:
+            name: Name of the part.
+            value: Its settings.
+
+        Raises:
+            ValueError: The part was begun with other settings.
+        """
         there = self.manifest["configuration"].setdefault(name, dict(value))
         other = sorted(key for key in there.keys() | value.keys() if there.get(key) != value.get(key))
         if other:
@@ -199,7 +235,7 @@ class GraspSetWriter:
             return manifest
         manifest = read_manifest(path.read_bytes(), str(path))
         for name, value in configuration.items():
-            there = manifest["configuration"].get(name)
+            there = manifest["configuration"].get(name, FIRST_EDITION.get(name))
             if there != value:
                 raise ValueError(
                     f"grasp set {self.folder} was made with {name} {there!r}, not {value!r}; go on with the same or "
@@ -211,7 +247,7 @@ class GraspSetWriter:
         return manifest
 
     def _save(self) -> None:
-        """Write the manifest with the counts of what is gathered."""
+        """Write the manifest with the counts of the gathered scenes."""
         generated = held = 0
         skipped: Counter[str] = Counter()
         kept = 0
@@ -237,7 +273,15 @@ class GraspSetWriter:
 
 
 def read_manifest(content: bytes, where: str) -> dict[str, Any]:
-    """A manifest from its bytes; ValueError where it is none of this version."""
+    """Read a manifest.
+
+    Args:
+        content: Its bytes.
+        where: Its place, for errors.
+
+    Raises:
+        ValueError: It is no manifest of this version.
+    """
     try:
         manifest = json.loads(content)
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -1,4 +1,4 @@
-"""Generative models: what proposes grasps for an observation."""
+"""Generative models: they propose grasps for a view."""
 
 from __future__ import annotations
 
@@ -6,34 +6,37 @@ from functools import lru_cache
 from pathlib import Path
 
 from dexzoo.generators.demonstration import load_demonstrations
-from dexzoo.generators.generator import GraspGenerator
+from dexzoo.generators.generator import GraspDensity, GraspGenerator
 from dexzoo.generators.heuristic import HeuristicGenerator
 from dexzoo.generators.kopicki import KopickiGenerator
+from dexzoo.hand import Hand
 
-_GENERATORS: dict[str, type[GraspGenerator]] = {"kopicki": KopickiGenerator, "heuristic": HeuristicGenerator}
+__all__ = ["GENERATORS", "GraspDensity", "GraspGenerator", "make_generator"]
 
-
-def list_generators() -> list[str]:
-    """Names of all generators, the default first."""
-    return list(_GENERATORS)
+GENERATORS = ("kopicki", "heuristic")
+"""Names of all generators, the default first."""
 
 
 @lru_cache(maxsize=4)
-def make_generator(name: str) -> GraspGenerator:
-    """The generator of that name with its default settings, or Kopicki's that learns from a folder of demonstrations.
+def make_generator(name: str, hand: Hand) -> GraspGenerator:
+    """Make a generator with its default settings.
 
-    Raises ValueError that names what exists, or says what is wrong with a demonstration.
+    Args:
+        name: A name in `GENERATORS`, or a folder of demonstrations that Kopicki's learns from.
+        hand: The hand that it proposes grasps of.
+
+    Returns:
+        The generator.
+
+    Raises:
+        FileNotFoundError: The hand has no demonstrations.
+        ValueError: The name is unknown, or a demonstration is damaged or of another hand.
     """
-    if name in _GENERATORS:
-        return _GENERATORS[name]()
+    if name == "heuristic":
+        return HeuristicGenerator(hand)
+    if name == "kopicki":
+        return KopickiGenerator(load_demonstrations(hand))
     if Path(name).is_dir():
-        return KopickiGenerator(load_demonstrations(name))
-    known = ", ".join(_GENERATORS)
+        return KopickiGenerator(load_demonstrations(hand, name))
+    known = ", ".join(GENERATORS)
     raise ValueError(f"generator {name!r} is unknown; use one of {known}, or a folder of demonstrations")
-
-
-def default_generator() -> KopickiGenerator:
-    """The one that `make_generator` gives as kopicki, whose density is the prior of refinement."""
-    generator = make_generator("kopicki")
-    assert isinstance(generator, KopickiGenerator)
-    return generator

@@ -1,4 +1,4 @@
-"""Demonstrations: one recorded grasp each, and what of the object's surface lay under the hand."""
+"""Demonstrations: one recorded grasp each, and the part of the object's surface that lay under the hand."""
 
 from __future__ import annotations
 
@@ -15,41 +15,52 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dexzoo.generators.features import Features
-from dexzoo.grasp import GRIP, Grasps
+from dexzoo.grasp import GRIP, Grasps, read_trajectory
 from dexzoo.hand import Hand
+from dexzoo.perception.surface import SurfaceFeatures
+from dexzoo.perception.table import MIN_POINTS
 from dexzoo.resources import resource
-from dexzoo.segmentation import MIN_POINTS
 
-SHIPPED = resource("robots") / "dlr2" / "demonstrations"
-"""The ten demonstrations of the DLR/HIT hand II, and preshapes.yaml, which they are made of."""
+FORMAT = "dexzoo.demonstration.2"
 REACH = 0.012
-"""Metres from the hand within which the surface is kept; the contact models' receptive field is smaller."""
+"""Meters from the hand within which the surface is kept; the contact models' receptive field is smaller."""
 MAX_SURFACE_DIFFERENCE, MAX_JOINT_DIFFERENCE = 0.006, 0.15
-"""Metres and radians within which two demonstrations are near-equal."""
+"""Meters and radians within which two demonstrations are near-equal."""
 MAX_GAP = 0.005
 SPACING = 0.0015
-"""Metres between the points that a mesh is known by."""
+"""Meters between the points that a mesh is known by."""
 
 
 @dataclass(frozen=True)
 class Demonstration:
     """One grasp of a known object, and the surface near the hand at its grip, all in the object's frame.
 
-    object: its name. grasp: one Grasps whose "world" frame is the object's. surface: features near the hand at the
-    grip.
+    Attributes:
+        object: Name of the object.
+        grasp: One grasp, whose world frame is the object's.
+        surface: Features of the surface near the hand at the grip.
     """
 
     object: str
     grasp: Grasps
-    surface: Features
+    surface: SurfaceFeatures
 
     @classmethod
-    def record(cls, grasp: Grasps, mesh: trimesh.Trimesh, hand: Hand, name: str = "object") -> Demonstration:
-        """From a grasp in the frame of the mesh of an object of that name, its faces turned outwards.
+    def record(cls, grasp: Grasps, mesh: trimesh.Trimesh, name: str = "object") -> Demonstration:
+        """Make a demonstration of a grasp of a known object.
 
-        Raises ValueError when the hand is not at the object at the grip.
+        Args:
+            grasp: One grasp in the frame of the mesh.
+            mesh: Mesh of the object in meters, its faces turned outwards.
+            name: Name of the object.
+
+        Returns:
+            The demonstration.
+
+        Raises:
+            ValueError: A joint is beyond its limits, or the hand is not at the object at the grip.
         """
+        hand = grasp.hand
         hand.check(grasp.joints)
         num = int(np.clip(mesh.area / SPACING**2, 2_000, 100_000))
         points, faces = trimesh.sample.sample_surface(mesh, num, seed=0)
@@ -59,12 +70,12 @@ class Demonstration:
         if near.sum() < MIN_POINTS or distance.min() > MAX_GAP:
             raise ValueError(
                 f"demonstration on {name}: the hand is {1000 * float(distance.min()):.0f} mm from the object "
-                "at the grip; give the grasp in the frame of the mesh, in metres"
+                "at the grip; give the grasp in the frame of the mesh, in meters"
             )
-        return cls(name, grasp, Features.of_surface(np.array(points), mesh.face_normals[faces], near))
+        return cls(name, grasp, SurfaceFeatures.of_surface(np.array(points), mesh.face_normals[faces], near))
 
     def near_surface(self) -> Float[Tensor, "point 3"]:
-        """The surface under the hand in the frame of the palm at the grip: what tells one contact from another."""
+        """The surface under the hand in the frame of the palm at the grip, by which contacts are compared."""
         pose = torch.linalg.inv(self.grasp.wrist_pose[0, GRIP])
         points: Tensor = self.surface.points @ pose[:3, :3].T + pose[:3, 3]
         return points
@@ -75,44 +86,95 @@ class Demonstration:
         return int(self.grasp.grasp_type[0])
 
     def save(self, path: str | Path) -> None:
-        """Write to a safetensors file."""
+        """Write to a safetensors file.
+
+        Args:
+            path: File to write.
+        """
         tensors = {
-            "waypoints": self.grasp.waypoints.float().contiguous(),
+            "wrist": self.grasp.wrist.float().contiguous(),
+            "joints": self.grasp.joints.float().contiguous(),
+            "grasp_type": self.grasp.grasp_type.contiguous(),
             "points": self.surface.points.contiguous(),
             "frames": self.surface.quaternion.contiguous(),
             "curvature": self.surface.curvature.contiguous(),
         }
-        save_file(tensors, str(path), {"format": "dexzoo.demonstration.1", "object": self.object})
+        save_file(tensors, str(path), {"format": FORMAT, "object": self.object, **self.grasp.hand.identity})
 
     @classmethod
-    def load(cls, path: str | Path) -> Demonstration:
-        """Read what `save` wrote. FileNotFoundError or ValueError when that is not possible."""
+    def load(cls, path: str | Path, hand: Hand | None = None) -> Demonstration:
+        """Read what `save` wrote.
+
+        Args:
+            path: File to read.
+            hand: Hand of the demonstration; by default the one that the file names, from robots/.
+
+        Returns:
+            The demonstration.
+
+        Raises:
+            FileNotFoundError: The file does not exist.
+            ValueError: The file is no demonstration, or of another hand.
+        """
         if not Path(path).is_file():
             raise FileNotFoundError(f"demonstration {path} does not exist")
         try:
             with safe_open(str(path), framework="pt") as file:
                 about = file.metadata() or {}
-                tensors = {key: file.get_tensor(key) for key in ("waypoints", "points", "frames", "curvature")}
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118, not a dict
         except SafetensorError as error:
             raise ValueError(f"{path} is no demonstration ({error}); write it with Demonstration.save") from None
-        surface = Features(tensors["points"], tensors["frames"], tensors["curvature"])
-        return cls(about.get("object", ""), Grasps(tensors["waypoints"], "world"), surface)
+        try:
+            surface = SurfaceFeatures(*(tensors[key] for key in ("points", "frames", "curvature")))
+            grasp = Grasps.of(read_trajectory(tensors), Hand.of_file(about, hand))
+        except KeyError as error:
+            raise ValueError(
+                f"{path} is no demonstration: it has no {error}; write it with Demonstration.save"
+            ) from None
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+        return cls(about.get("object", ""), grasp, surface)
 
 
 @lru_cache(maxsize=4)
-def load_demonstrations(folder: str = "") -> tuple[Demonstration, ...]:
-    """The demonstrations of a folder, by name of the file; those of the DLR/HIT hand II by default."""
-    where = Path(folder) if folder else SHIPPED
+def load_demonstrations(hand: Hand, folder: str = "") -> tuple[Demonstration, ...]:
+    """Load the demonstrations of a folder, by name of the file.
+
+    Args:
+        hand: The hand that they must be of.
+        folder: Folder of .safetensors files; by default the one that comes with the hand.
+
+    Returns:
+        The demonstrations.
+
+    Raises:
+        FileNotFoundError: The folder holds no demonstration.
+        ValueError: A file is no demonstration, or of another hand.
+    """
+    where = Path(folder) if folder else shipped_demonstrations(hand)
     paths = sorted(where.glob("*.safetensors"))
     if not paths:
         raise FileNotFoundError(f"folder {where} holds no demonstration; make some with python -m dexzoo demonstrate")
-    return tuple(Demonstration.load(path) for path in paths)
+    return tuple(Demonstration.load(path, hand) for path in paths)
+
+
+def shipped_demonstrations(hand: Hand) -> Path:
+    """Folder of the demonstrations that come with a hand, and of preshapes.yaml, which they are made of.
+
+    Args:
+        hand: The hand.
+    """
+    return resource("robots") / hand.spec.name / "demonstrations"
 
 
 def distinct(demonstrations: Sequence[Demonstration], max_per_type: int) -> list[Demonstration]:
-    """Those that differ in what they touch or how; of near-equal ones of a type the first is kept.
+    """Demonstrations that differ in touched surface or posture; of near-equal ones of a type the first is kept.
 
     Near-equal: the surfaces under the hand lie within 6 mm of each other on average, and no joint differs by 0.15 rad.
+
+    Args:
+        demonstrations: Demonstrations; the earlier ones are preferred.
+        max_per_type: Most demonstrations of a grasp type.
     """
     kept: list[Demonstration] = []
     for one in demonstrations:

@@ -1,49 +1,125 @@
-"""What a generator is: one observation in, ranked grasps out."""
+"""The interface of a generator: one view in, ranked grasps out, and the density that it draws them from."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from dexzoo.camera import Observation
-from dexzoo.grasp import GRIP, NUM_TYPES, Grasps
+from dexzoo.grasp import GRIP, NUM_TYPES, Grasps, Trajectory
+from dexzoo.hand import Hand
+from dexzoo.perception import Observation, View
 
 MIN_CLEARANCE = 0.002
-"""Metres that every link keeps from the table up to the grip."""
+"""Meters that every link keeps from the table up to the grip."""
 MAX_REACH = 0.24
-"""Metres that the wrist may be from the nearest observed point at the pre-grasp; the stand-off is shortened for it."""
+"""Meters that the wrist may be from the nearest observed point at the pre-grasp; the stand-off is shortened for it."""
+
+
+class GraspDensity(ABC):
+    """Density of grasps for one view, the prior of refinement."""
+
+    @abstractmethod
+    def log_density(self, grasps: Trajectory) -> Float[Tensor, " grasp"]:
+        """Log-density of grasps; differentiable where it is finite.
+
+        Args:
+            grasps: Grasps in the world frame of the view.
+
+        Returns:
+            Log-density up to a constant; -inf where there is none.
+        """
+
+    def near(self, grasps: Trajectory) -> Callable[[Trajectory], Float[Tensor, " grasp"]]:
+        """The log-density as a function of grasps that stay near some given ones, row by row.
+
+        Args:
+            grasps: Grasps in the world frame of the view.
+
+        Returns:
+            The function, differentiable and finite; 0 for a grasp of which the density says nothing.
+        """
+        known = torch.isfinite(self.log_density(grasps))
+
+        def value(moved: Trajectory) -> Tensor:
+            density = self.log_density(moved)
+            return torch.where(known & torch.isfinite(density), density, 0.0)
+
+        return value
 
 
 class GraspGenerator(ABC):
-    """Proposes grasps for an object seen once."""
+    """Proposes grasps of one hand for an object seen once.
+
+    Attributes:
+        hand: The hand.
+    """
+
+    hand: Hand
 
     @abstractmethod
-    def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
-        """At most `num_grasps` grasps in the camera frame, best first; the same for the same seed.
+    def generate(self, observation: Observation | View, num_grasps: int = 100, seed: int = 0) -> Grasps:
+        """Propose grasps.
 
-        Raises ValueError when too little of the object is seen, RuntimeError when no feasible grasp is found.
+        Args:
+            observation: The view of the object.
+            num_grasps: Most grasps to propose.
+            seed: The same seed gives the same grasps.
+
+        Returns:
+            Grasps in the world frame of the observation, best first.
+
+        Raises:
+            ValueError: Too little of the object is seen.
+            RuntimeError: No feasible grasp is found.
         """
+
+    def density(self, observation: Observation | View, seed: int = 0) -> GraspDensity | None:
+        """The density that grasps of a view are drawn from, as a prior for refinement.
+
+        Args:
+            observation: The view of the object.
+            seed: Seed of the draws that make the density.
+
+        Returns:
+            The density, or None if the generator has none.
+
+        Raises:
+            ValueError: Too little of the object is seen.
+        """
+        return None
 
 
 def spread(grasps: Grasps, score: Tensor, num: int, num_per_type: int | None = None) -> Tensor:
-    """Indices of `num` grasps, best first, passing over those within 1 cm and 0.2 rad of a better one of their type.
+    """Choose the best grasps that differ from each other.
 
-    score: (num_grasps,), higher is better. num_per_type: most of one type; None for as many as there are.
+    A grasp within 1 cm and 0.2 rad of a better one of its type is passed over.
+
+    Args:
+        grasps: Grasps to choose from.
+        score: Score of each, higher is better, (grasp,).
+        num: Most grasps to choose.
+        num_per_type: Most grasps of one type; None for as many as there are.
+
+    Returns:
+        Indices of the chosen grasps, best first.
     """
-    grip, taken, chosen = grasps.waypoints[:, GRIP], [0] * NUM_TYPES, list[int]()
+    position, quaternion, types = grasps.position[:, GRIP], grasps.quaternion[:, GRIP], grasps.grasp_type
+    taken, chosen = [0] * NUM_TYPES, list[int]()
     for index in score.argsort(descending=True, stable=True).tolist():
         if len(chosen) == num:
             break
-        kind = int(grip[index, 27])
+        kind = int(types[index])
         if num_per_type is not None and taken[kind] >= num_per_type:
             continue
-        near = (grip[chosen, :3] - grip[index, :3]).norm(dim=-1) < 0.01
-        near &= (grip[chosen, 3:7] * grip[index, 3:7]).sum(-1).abs() > np.cos(0.1)
-        near &= grip[chosen, 27] == kind
+        near = (position[chosen] - position[index]).norm(dim=-1) < 0.01
+        near &= (quaternion[chosen] * quaternion[index]).sum(-1).abs() > np.cos(0.1)
+        near &= types[chosen] == kind
         if not near.any():
             chosen.append(index)
             taken[kind] += 1
-    return torch.tensor(chosen)
+    return torch.tensor(chosen, dtype=torch.long)

@@ -1,6 +1,6 @@
 """Heuristic grasps: the thumb opposite the fingers across a graspable width of the observed cloud.
 
-This is the baseline of hand-made grasp procedures, not a learnt model. The object's hidden side is guessed by turning
+This is the baseline of hand-made grasp procedures, not a learned model. The object's hidden side is guessed by turning
 the cloud half round about the vertical axis through its middle.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,36 +15,47 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dexzoo import rotation
-from dexzoo.camera import Observation
 from dexzoo.generators.generator import MAX_REACH, MIN_CLEARANCE, GraspGenerator, spread
-from dexzoo.grasp import GRASP_TYPES, Grasps, pose_matrix
-from dexzoo.hand import Hand, default_hand
-from dexzoo.segmentation import MIN_POINTS
+from dexzoo.grasp import GRASP_TYPES, Grasps, Trajectory
+from dexzoo.hand import Hand
+from dexzoo.perception import Observation, View
+from dexzoo.perception.hidden_side import guess_hidden_side
+from dexzoo.perception.table import MIN_POINTS
+from dexzoo.rotation import pose_matrix
 
 MAX_WIDTH = 0.085
-"""Widest thing in metres that fits between open thumb and fingers."""
+"""Widest thing in meters that fits between open thumb and fingers."""
 MAX_PENETRATION = 0.002
 STANDOFF = 0.09
-SQUEEZE = 0.35
+SQUEEZE_TRAVEL = 0.35
 """Radians that mcp and pip go on from the grip to the squeeze."""
 _LEVELS = 12
 _CHUNK = 128
 
 
 @dataclass(frozen=True)
-class Preshape:
-    """How the hand opens and closes. Angles in radians of (abd, mcp, pip), open and closed, and who takes part."""
+class GraspTemplate:
+    """How the hand opens and closes for one type of grasp. Angles are radians of (abd, mcp, pip).
+
+    Attributes:
+        grasp_type: Index into `GRASP_TYPES`.
+        open: Angles of the open fingers.
+        closed: Angles of the closed fingers.
+        fingers: Fingers that take part.
+        reach: Bounds in meters from the wrist to the object's middle along the fingers.
+        aside: Bounds in meters towards the thumb's side.
+    """
 
     grasp_type: int
     open: tuple[float, float, float]
     closed: tuple[float, float, float]
     fingers: tuple[str, ...]
-    reach: tuple[float, float]  # metres from the wrist to the object's middle along the fingers
-    aside: tuple[float, float]  # and towards the thumb's side
+    reach: tuple[float, float]
+    aside: tuple[float, float]
 
 
-_PRESHAPES = (
-    Preshape(
+_TEMPLATES = (
+    GraspTemplate(
         GRASP_TYPES.index("power"),
         (0.0, 0.0, 0.15),
         (0.0, 1.4, 1.1),
@@ -53,7 +63,7 @@ _PRESHAPES = (
         (0.11, 0.17),
         (-0.02, 0.03),
     ),
-    Preshape(
+    GraspTemplate(
         GRASP_TYPES.index("top"),
         (0.0, 0.0, 0.3),
         (0.0, 1.2, 0.8),
@@ -61,7 +71,7 @@ _PRESHAPES = (
         (0.15, 0.20),
         (-0.02, 0.03),
     ),
-    Preshape(
+    GraspTemplate(
         GRASP_TYPES.index("tripod"),
         (0.0, 0.1, 0.35),
         (0.0, 1.2, 0.7),
@@ -69,7 +79,9 @@ _PRESHAPES = (
         (0.165, 0.205),
         (0.0, 0.045),
     ),
-    Preshape(GRASP_TYPES.index("pinch"), (0.0, 0.1, 0.35), (0.0, 1.2, 0.7), ("index",), (0.17, 0.205), (0.02, 0.055)),
+    GraspTemplate(
+        GRASP_TYPES.index("pinch"), (0.0, 0.1, 0.35), (0.0, 1.2, 0.7), ("index",), (0.17, 0.205), (0.02, 0.055)
+    ),
 )
 _RESTING = (0.0, 0.1, 0.2)  # of fingers that take no part
 
@@ -77,30 +89,42 @@ _RESTING = (0.0, 0.1, 0.2)  # of fingers that take no part
 class HeuristicGenerator(GraspGenerator):
     """Grasps across graspable widths with power, top, tripod and pinch preshapes.
 
-    num_samples: candidates drawn before those that collide are dropped.
+    Args:
+        hand: The hand; its joints and links are named by finger as those of dlr2.
+        num_samples: Candidates drawn before those that collide are dropped.
     """
 
-    def __init__(self, num_samples: int = 3000) -> None:
+    def __init__(self, hand: Hand, num_samples: int = 3000) -> None:
         self.num_samples = num_samples
-        self.hand: Hand = default_hand()
+        self.hand = hand
 
-    def generate(self, observation: Observation, num_grasps: int = 100, seed: int = 0) -> Grasps:
-        """Up to `num_grasps` grasps in the camera frame, those with the best opposition first.
+    def generate(self, observation: Observation | View, num_grasps: int = 100, seed: int = 0) -> Grasps:
+        """Propose grasps, those with the best opposition first.
 
-        Raises ValueError when too little of the object is seen, RuntimeError when no candidate is feasible.
+        Args:
+            observation: The view of the object.
+            num_grasps: Most grasps to propose.
+            seed: The same seed gives the same grasps.
+
+        Returns:
+            Grasps in the world frame of the observation.
+
+        Raises:
+            ValueError: Too little of the object is seen.
+            RuntimeError: No feasible grasp is found.
         """
         if num_grasps < 1:
             raise ValueError(f"num_grasps is {num_grasps}, expected at least 1")
+        seen = View.of(observation).observation
         rng = np.random.default_rng(seed)
-        cloud, normals = complete(observation, rng)
+        cloud, normals = complete(seen, rng)
         position, quaternion, shape = self._sample(cloud, normals, rng)
-        observed = observation.points_world[:: max(1, len(observation.points_world) // 500)]
+        observed = seen.points_world[:: max(1, len(seen.points_world) // 500)]
         grasps, score = self._close(cloud, normals, observed, position, quaternion, shape)
         if not len(grasps):
             raise RuntimeError("no feasible grasp is found: the object may be too large, too flat or out of reach")
         order = spread(grasps, score, num_grasps)
-        ranked = Grasps(grasps.waypoints[order], "world", score[order])
-        return ranked.to_frame("camera", observation.T_world_camera)
+        return Grasps.of(grasps.trajectory[order], self.hand, score[order])
 
     def _sample(
         self, cloud: NDArray[np.float32], normals: NDArray[np.float32], rng: np.random.Generator
@@ -112,7 +136,7 @@ class HeuristicGenerator(GraspGenerator):
         upper = np.flatnonzero(cloud[:, 2] > cloud[:, 2].max() - 0.025)
         seed_point[thin] = rng.choice(upper, thin.sum())
         point = cloud[seed_point]
-        # the width is measured along the surface normal, levelled in half of the cases
+        # the width is measured along the surface normal, leveled in half of the cases
         across = normals[seed_point] + 0.15 * rng.normal(size=(n, 3))
         across[rng.random(n) < 0.5, 2] = 0
         across /= np.linalg.norm(across, axis=1, keepdims=True) + 1e-9
@@ -121,7 +145,7 @@ class HeuristicGenerator(GraspGenerator):
         low, high = np.where(thin, wall_low, low), np.where(thin, wall_high, high)
         width = high - low
         middle = point + across * ((low + high) / 2)[:, None]
-        shape = rng.integers(len(_PRESHAPES), size=n)
+        shape = rng.integers(len(_TEMPLATES), size=n)
 
         # the fingers point along `along`, square to the width, from the side or from above
         tilt = np.where(thin, rng.uniform(1.0, np.pi / 2 + 0.2, n), rng.uniform(-0.3, np.pi / 2 + 0.2, n))
@@ -133,7 +157,7 @@ class HeuristicGenerator(GraspGenerator):
         x = across * rng.choice([-1, 1], n)[:, None]
         y = np.cross(along, x)
         turn = np.stack((x, y, along), axis=-1)
-        reach, aside = np.array([_PRESHAPES[i].reach for i in shape]), np.array([_PRESHAPES[i].aside for i in shape])
+        reach, aside = np.array([_TEMPLATES[i].reach for i in shape]), np.array([_TEMPLATES[i].aside for i in shape])
         center = np.stack(
             (
                 width / 2 + rng.uniform(0.008, 0.045, n),
@@ -156,10 +180,10 @@ class HeuristicGenerator(GraspGenerator):
         quaternion: Tensor,
         shape: NDArray[np.int64],
     ) -> tuple[Grasps, Tensor]:
-        """Drop what collides, close each finger until it touches the cloud, and score the opposition."""
+        """Drop colliding candidates, close each finger until it touches the cloud, and score the opposition."""
         hand, points = self.hand, torch.tensor(cloud)
-        opened = torch.stack([self._posture(p, 0.0) for p in _PRESHAPES])
-        closed = torch.stack([self._posture(p, 1.0) for p in _PRESHAPES])
+        opened = torch.stack([self._posture(p, 0.0) for p in _TEMPLATES])
+        closed = torch.stack([self._posture(p, 1.0) for p in _TEMPLATES])
         table = torch.tensor([0.0, 0, 1, 0])
         kept: list[Grasps] = []
         scores: list[Tensor] = []
@@ -192,10 +216,10 @@ class HeuristicGenerator(GraspGenerator):
                 )
                 scores.append(score[good])
         if not kept:
-            return Grasps(torch.zeros(0, 10, 28), "world"), torch.zeros(0)
+            return Grasps.none(hand), torch.zeros(0)
         return Grasps.concatenate(kept), torch.cat(scores)
 
-    def _posture(self, preshape: Preshape, level: float) -> Tensor:
+    def _posture(self, preshape: GraspTemplate, level: float) -> Tensor:
         """Free joints at a level of closing between 0 and 1; fingers that take no part rest."""
         angles = []
         for name in self.hand.freedoms:
@@ -226,7 +250,7 @@ class HeuristicGenerator(GraspGenerator):
             first = torch.where(hit.any(1), hit.int().argmax(1), _LEVELS - 1)
             joints = [i for i, name in enumerate(self.hand.freedoms) if name.startswith(finger)]
             grip[:, joints] = posture[rows, first][:, joints]
-            takes_part = torch.tensor([finger == "thumb" or finger in p.fingers for p in _PRESHAPES])[preshape]
+            takes_part = torch.tensor([finger == "thumb" or finger in p.fingers for p in _TEMPLATES])[preshape]
             contact[:, index] = hit.any(1) & (first > 0) & takes_part
             solid = torch.tensor(solids)[which[rows, first]]
             touched[:, index] = nearest[rows, first, solid]
@@ -244,32 +268,42 @@ class HeuristicGenerator(GraspGenerator):
         position = torch.stack((pregrasp, wrist[:, :3, 3], wrist[:, :3, 3]), 1)
         finger = [self.hand.fingers.index(name.split("_")[0]) for name in hand.freedoms]
         flexes = torch.tensor([not name.endswith("_abd") for name in hand.freedoms])
-        press = SQUEEZE * (contact[:, finger] & flexes)
+        press = SQUEEZE_TRAVEL * (contact[:, finger] & flexes)
         squeeze = hand.clamp(grip + press)
         joints = hand.expand(torch.stack((opened, grip, squeeze), 1))
-        types = torch.tensor([p.grasp_type for p in _PRESHAPES])[preshape]
-        return Grasps.from_keyframes(position, quaternion[:, None].expand(-1, 3, -1), joints, types, "world")
+        types = torch.tensor([p.grasp_type for p in _TEMPLATES])[preshape]
+        motion = Trajectory.from_keyframes(position, quaternion[:, None].expand(-1, 3, -1), joints, types)
+        return Grasps.of(motion, hand)
 
 
 def complete(observation: Observation, rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The observed cloud and its guessed hidden side in the world frame, 440 points at most, with outward normals."""
+    """The observed cloud and a guess of its hidden side.
+
+    Args:
+        observation: The view of the object.
+        rng: Chooses the points.
+
+    Returns:
+        At most 440 points in the world frame, and their outward normals.
+
+    Raises:
+        ValueError: Too little of the object is seen.
+    """
     cloud = observation.points_world
     if len(cloud) < MIN_POINTS:
         raise ValueError(f"the object has {len(cloud)} points, fewer than the {MIN_POINTS} a grasp can be planned on")
     cloud = cloud[rng.permutation(len(cloud))[:1500]]
     tree = cKDTree(cloud)
-    neighbours = cloud[tree.query(cloud, k=20)[1]]
-    centred = neighbours - neighbours.mean(1, keepdims=True)
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0]
+    neighbors = cloud[tree.query(cloud, k=20)[1]]
+    centered = neighbors - neighbors.mean(1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))[1][:, :, 0]
     camera = observation.T_world_camera[:3, 3]
     normals *= np.sign(((camera - cloud) * normals).sum(1, keepdims=True) + 1e-12)
     chosen = rng.permutation(len(cloud))[:220]
     cloud, normals = cloud[chosen], normals[chosen]
-    (cx, cy), _, _ = cv2.minAreaRect(cloud[:, :2].astype(np.float32))
-    turned, turned_normals = cloud.copy(), normals.copy()
-    turned[:, :2] = 2 * np.array([cx, cy]) - cloud[:, :2]
-    turned_normals[:, :2] *= -1
-    hidden = ~observation.would_see(turned)  # what would be in plain view would have been seen, so it is not there
+    turned_points, may_be_there = guess_hidden_side(observation, torch.from_numpy(cloud))
+    turned, hidden = turned_points.numpy(), may_be_there.numpy()
+    turned_normals = normals * np.array([-1, -1, 1])
     return (
         np.concatenate((cloud, turned[hidden])).astype(np.float32),
         np.concatenate((normals, turned_normals[hidden])).astype(np.float32),
@@ -285,7 +319,7 @@ def _extent(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lowest and highest coordinate of the cloud along lines through `point`, within `radius` of them.
 
-    gap: stop where the cloud has a hole of that many metres.
+    gap: stop where the cloud has a hole of that many meters.
     """
     offset = cloud[None] - point[:, None]
     along = np.einsum("npi,ni->np", offset, direction)

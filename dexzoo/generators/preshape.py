@@ -17,16 +17,17 @@ import yaml
 from torch import Tensor
 
 from dexzoo import rotation
-from dexzoo.grasp import GRASP_TYPES, Grasps, pose_matrix
+from dexzoo.grasp import GRASP_TYPES, Grasps, Trajectory
 from dexzoo.hand import Hand
+from dexzoo.rotation import pose_matrix
 
 STANDOFF = 0.09
-"""Metres from the pre-grasp to the grip."""
-SQUEEZE = 0.523
+"""Meters from the pre-grasp to the grip."""
+SQUEEZE_TRAVEL = 0.523
 """Radians that the joint which closes furthest goes on from the grip to the squeeze (the thesis' 30 degrees)."""
 _LEVELS = 60
 _NUM_POINTS = 20_000
-_REACH = 0.25  # metres from the wrist that the fingers cannot pass
+_REACH = 0.25  # meters from the wrist that the fingers cannot pass
 _TOLERANCE = 0.001
 
 
@@ -34,9 +35,13 @@ _TOLERANCE = 0.001
 class Preshape:
     """A hand about to close on an object.
 
-    object: name of a known object, or its mesh file. wrist: (4, 4) pose of the palm at the grip in the object's frame.
-    opened, closed: (15,) free joints to begin with and to close towards, rad; a finger for which they are equal stays
-    as it is. approach: (3,) metres from the grip to the pre-grasp in the palm frame.
+    Attributes:
+        grasp_type: Index into `GRASP_TYPES`.
+        object: Name of a known object, or its mesh file.
+        wrist: Pose of the palm at the grip in the object's frame, (4, 4).
+        opened: Free joints to begin with, radians, (freedom,).
+        closed: Free joints to close towards; a finger for which they equal `opened` stays as it is.
+        approach: Vector in meters from the grip to the pre-grasp in the palm frame, (3,).
     """
 
     grasp_type: int
@@ -48,10 +53,18 @@ class Preshape:
 
 
 def read_preshapes(path: str | Path, hand: Hand) -> list[Preshape]:
-    """The preshapes of a YAML file: for each grasp type object, wrist {position, quaternion}, open, closed, approach.
+    """Read the preshapes of a YAML file.
 
-    open and closed give the free joints of each finger by its name. Raises FileNotFoundError or ValueError that names
-    the entry at fault.
+    For each grasp type the file has object, wrist {position, quaternion}, open, closed and approach; open and closed
+    give the free joints of each finger by its name.
+
+    Args:
+        path: File to read.
+        hand: The hand.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: An entry is wrong; the error names it.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"file of preshapes {path} does not exist")
@@ -84,11 +97,21 @@ def _read(name: str, entry: dict[str, Any], hand: Hand, where: str) -> Preshape:
 
 
 def close(preshape: Preshape, mesh: trimesh.Trimesh, hand: Hand) -> Grasps:
-    """The grasp, in the mesh's frame, whose fingers stop where they first touch.
+    """Close the hand on an object: each finger stops when it first touches.
 
-    Each finger closes evenly until one of its links touches the mesh; where that is its first, the others go on. From
-    the grip on, each flexing joint goes as it came, the one that came furthest by 0.523 rad.
-    Raises ValueError when the open hand is in the mesh, or the thumb or all the other fingers miss it.
+    Each finger closes evenly until one of its links touches the mesh; if that is its first, the others go on. From the
+    grip on, each flexing joint goes on as it came, the one that came furthest by 0.523 rad.
+
+    Args:
+        preshape: The open hand.
+        mesh: The object, meters.
+        hand: The hand.
+
+    Returns:
+        The grasp, in the frame of the mesh.
+
+    Raises:
+        ValueError: The open hand is in the mesh, or the thumb or all the other fingers miss it.
     """
     points, _ = trimesh.sample.sample_surface(mesh, _NUM_POINTS, seed=0)
     cloud = torch.tensor(np.array(points), dtype=torch.float32)
@@ -134,22 +157,33 @@ def _path(preshape: Preshape, grip: Tensor, hand: Hand) -> Grasps:
     """Pre-grasp, grip and squeeze of one grasp."""
     came = grip - preshape.opened
     came[[i for i, name in enumerate(hand.freedoms) if name.endswith("_abd")]] = 0
-    squeeze = hand.clamp(grip + came * (SQUEEZE / came.abs().max().clamp_min(1e-3)))
+    squeeze = hand.clamp(grip + came * (SQUEEZE_TRAVEL / came.abs().max().clamp_min(1e-3)))
     pregrasp = preshape.wrist.clone()
     pregrasp[:3, 3] += preshape.wrist[:3, :3] @ preshape.approach
     position = torch.stack((pregrasp[:3, 3], preshape.wrist[:3, 3], preshape.wrist[:3, 3]))[None]
     quaternion = rotation.from_matrix(preshape.wrist[:3, :3]).expand(1, 3, 4)
     joints = hand.expand(torch.stack((preshape.opened, grip, squeeze)))[None]
-    return Grasps.from_keyframes(position, quaternion, joints, torch.tensor([preshape.grasp_type]), "world")
+    motion = Trajectory.from_keyframes(position, quaternion, joints, torch.tensor([preshape.grasp_type]))
+    return Grasps.of(motion, hand)
 
 
 def read_recording(path: str | Path, hand: Hand) -> Grasps:
-    """One grasp, in the frame of its object, from a JSON file.
+    """Read one grasp from a JSON file.
 
     {"grasp_type": name, "waypoints": [{"position": [3], "quaternion": [4], "joints": [15 or 20]}, ...]}: the wrist in
-    metres and wxyz, the free joints or all in radians. The first waypoint is the pre-grasp, the last the grip; the
+    meters and wxyz, the free joints or all in radians. The first waypoint is the pre-grasp, the last the grip; the
     squeeze goes on from there as in `close`.
-    Raises FileNotFoundError or ValueError that says what is wrong.
+
+    Args:
+        path: File to read.
+        hand: The hand.
+
+    Returns:
+        The grasp, in the frame of its object.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is no such recording.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"recording {path} does not exist")

@@ -10,24 +10,34 @@ from scipy.stats import vonmises_fisher
 from torch import Tensor
 
 from dexzoo import rotation
-from dexzoo.generators.density import GraspDensity, Grips
-from dexzoo.grasp import pose_matrix, step_pose
+from dexzoo.generators.contact_density import ContactDensity, Grips
+from dexzoo.rotation import pose_matrix, step_pose
 
 WRIST_STEP, TURN_CONCENTRATION, JOINT_STEP = 0.003, 500.0, 0.015708
-"""Proposals of the annealing at full temperature: metres, concentration on the sphere of quaternions, radians."""
+"""Proposals of the annealing at full temperature: meters, concentration on the sphere of quaternions, radians."""
 TEMPERATURE = 0.05
-"""Log-likelihood that is given away with probability 1/e at full temperature."""
+"""Loss of log-likelihood that is accepted with probability 1/e at full temperature."""
 RATES = (0.002, 0.02, 0.01)
-"""Adam's steps: metres and radians of the wrist, radians of the joints."""
+"""Adam's steps: meters and radians of the wrist, radians of the joints."""
 REFRESH = 25
-"""Steps for which the neighbouring kernels of a grip are kept."""
+"""Steps for which the neighboring kernels of a grip are kept."""
 
 CostNear = Callable[[Grips], Callable[[Grips], Tensor]]
 """Given grips, their cost as a function that serves as long as they stay near."""
 
 
-def climb(density: GraspDensity, grips: Grips, cost_near: CostNear, num_steps: int) -> Grips:
-    """Gradient ascent (Adam) on ln likelihood - cost, over the wrist's tangent space and the free joints."""
+def ascend(density: ContactDensity, grips: Grips, cost_near: CostNear, num_steps: int) -> Grips:
+    """Gradient ascent (Adam) on log-likelihood - cost, over the wrist's tangent space and the free joints.
+
+    Args:
+        density: The density.
+        grips: Grips to start from.
+        cost_near: Gives their cost.
+        num_steps: Number of steps.
+
+    Returns:
+        The improved grips.
+    """
     tangent = torch.zeros(len(grips.demo), 6, requires_grad=True)
     change = torch.zeros_like(grips.joints, requires_grad=True)
     scale = torch.tensor([RATES[0]] * 3 + [RATES[1]] * 3)
@@ -40,7 +50,7 @@ def climb(density: GraspDensity, grips: Grips, cost_near: CostNear, num_steps: i
     for step in range(num_steps):
         if step % REFRESH == 0:
             with torch.no_grad():
-                near, cost = density.neighbours(moved()), cost_near(moved())
+                near, cost = density.neighbors(moved()), cost_near(moved())
         for group in optimizer.param_groups:
             group["lr"] = 1 - 0.9 * step / num_steps
         optimizer.zero_grad()
@@ -53,15 +63,26 @@ def climb(density: GraspDensity, grips: Grips, cost_near: CostNear, num_steps: i
 
 
 def anneal(
-    density: GraspDensity, grips: Grips, cost_near: CostNear, num_steps: int, generator: torch.Generator
+    density: ContactDensity, grips: Grips, cost_near: CostNear, num_steps: int, generator: torch.Generator
 ) -> Grips:
-    """Simulated annealing as Kopicki's: the temperature falls linearly from 1 to 0.1, and with it the steps."""
+    """Simulated annealing as Kopicki's: the temperature falls linearly from 1 to 0.1, and with it the steps.
+
+    Args:
+        density: The density.
+        grips: Grips to start from.
+        cost_near: Gives their cost.
+        num_steps: Number of steps.
+        generator: Source of randomness.
+
+    Returns:
+        The improved grips.
+    """
     count = len(grips.demo)
     rng = np.random.default_rng(int(torch.randint(2**31, (1,), generator=generator)))
     for step in range(num_steps):
         heat = 1 - 0.9 * step / max(num_steps - 1, 1)
         if step % REFRESH == 0:
-            near, cost = density.neighbours(grips), cost_near(grips)
+            near, cost = density.neighbors(grips), cost_near(grips)
             value = density.log_likelihood(grips, near) - cost(grips)
         shift = heat * WRIST_STEP * torch.randn(count, 3, generator=generator)
         turn = vonmises_fisher([1.0, 0, 0, 0], TURN_CONCENTRATION).rvs(count, random_state=rng)

@@ -1,1 +1,1 @@
-"""Evaluative models: what predicts whether a grasp will hold."""
+"""Evaluative models: they predict whether a grasp will hold."""

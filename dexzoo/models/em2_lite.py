@@ -5,13 +5,18 @@ from __future__ import annotations
 from typing import ClassVar, Unpack
 
 from dexzoo.models.em2 import EM2
-from dexzoo.models.evaluator import TrainingOptions
+from dexzoo.models.evaluator import EvaluatorOptions
 
 
 class EM2Lite(EM2):
     """EM2 with EfficientNet-lite0, whose ImageNet weights come with dexzoo, in place of VGG-16; ours.
 
-    The arguments are `EM2`'s.
+    Args:
+        width: As in `EM2`.
+        trunk: As in `EM2`.
+        dropout: As in `EM2`.
+        gain: As in `EM2`.
+        options: Arguments of `GraspEvaluator`.
     """
 
     architecture: ClassVar[str] = "em2_lite"
@@ -22,6 +27,6 @@ class EM2Lite(EM2):
         trunk: str = "lite0",
         dropout: float = 0.5,
         gain: float = 1.0,
-        **training: Unpack[TrainingOptions],
+        **options: Unpack[EvaluatorOptions],
     ) -> None:
-        super().__init__(width, trunk, dropout, gain, **training)
+        super().__init__(width, trunk, dropout, gain, **options)

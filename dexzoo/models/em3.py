@@ -5,14 +5,18 @@ from __future__ import annotations
 from typing import ClassVar, Unpack
 
 from dexzoo.models.em2 import EM2
-from dexzoo.models.evaluator import TrainingOptions
+from dexzoo.models.evaluator import EvaluatorOptions
 
 
 class EM3(EM2):
     """EM2 with ResNet-50 in place of VGG-16: our reading of the third model of Aktas et al. (arXiv 1908.04293).
 
-    trunk: "resnet50_views", trained here on rendered views, or "resnet50", ImageNet weights fetched by torchvision.
-    The other arguments are `EM2`'s.
+    Args:
+        width: As in `EM2`.
+        trunk: "resnet50_views", trained here on rendered views, or "resnet50", ImageNet weights fetched by torchvision.
+        dropout: As in `EM2`.
+        gain: As in `EM2`.
+        options: Arguments of `GraspEvaluator`.
     """
 
     architecture: ClassVar[str] = "em3"
@@ -23,6 +27,6 @@ class EM3(EM2):
         trunk: str = "resnet50_views",
         dropout: float = 0.5,
         gain: float = 1.0,
-        **training: Unpack[TrainingOptions],
+        **options: Unpack[EvaluatorOptions],
     ) -> None:
-        super().__init__(width, trunk, dropout, gain, **training)
+        super().__init__(width, trunk, dropout, gain, **options)

@@ -11,12 +11,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from dexzoo import rotation
-from dexzoo.camera import Camera
-from dexzoo.grasp import GRIP, JOINTS, POSITION, PREGRASP, QUATERNION, SQUEEZE
-from dexzoo.hand import default_hand
-from dexzoo.models.evaluator import GraspEvaluator, Scene, TrainingOptions
-from dexzoo.models.hand_points import surface_points
+from dexzoo.grasp import GRIP, PREGRASP, SQUEEZE, Trajectory
+from dexzoo.hand.surface_points import surface_points
+from dexzoo.models.batch import Encoding
+from dexzoo.models.evaluator import EvaluatorOptions, GraspEvaluator
 from dexzoo.models.view_geometry import cloud, upright_axes, view_geometry
+from dexzoo.perception.camera import Camera
 
 STAGES = [PREGRASP, GRIP // 2, GRIP, SQUEEZE]
 """The waypoints at which the hand is placed."""
@@ -24,30 +24,36 @@ NUM_POINTS = 6
 """Points on each primitive of the hand."""
 NUM_CLOUD = 192
 NEAR, FAR = 0.01, 0.05
-"""Metres over which lengths are told apart: the scales of the squashed features, contact and approach."""
+"""Scales in meters of the squashed features: contact and approach."""
 MIN_DEPTH = 0.05
 """Points nearer to the camera's plane than this, or behind it, are projected as if they were there."""
 FEATURES = {"hand": 9, "table": 2, "depth": 5, "cloud": 5, "image": 32}
-"""Numbers that each ingredient tells of a point."""
+"""Numbers of each ingredient for a point."""
 _PART = 1024
-"""Points whose nearest are looked for at once, so that the distances stay in cache."""
+"""Points that are looked up together, so that the distances stay in cache."""
 
 
 class EMFK(GraspEvaluator):
-    """Ours: what each link touches, computed by forward kinematics, and what the image shows there.
+    """Ours: points of the hand, placed by forward kinematics, look at the observed surface around them.
 
     Six points on the grasping side of each of the hand's primitives are placed by forward kinematics at the pre-grasp,
-    half way, at the grip and at the squeeze, which reaches into the object by as much as it will press. Each point
-    tells where it is; its height over the table; how far before or behind the observed surface it is along its ray
-    and along the surface's normal; where the nearest point of the object is; and what a small convolutional pyramid,
-    encoded once for each view, shows at its projection. A primitive's points at all stages make its token; attention
+    half way, at the grip and at the squeeze, which reaches into the object by as much as it will press. The
+    features of a point are its place; its height over the table; its distance to the observed surface along its ray and
+    along the surface's normal; the nearest point of the object; and the features of a small convolutional pyramid,
+    encoded once for each view, at its projection. A primitive's points at all stages make its token; attention
     among tokens, and from one query to all, makes one logit. All of it is differentiable in the grasp.
 
-    image, depth, cloud, table: whether these ingredients enter. way: whether the hand is looked at at all four
-    waypoints, or at the grip alone. attention: whether tokens attend to each other and are pooled by attention, or each
-    goes alone and the mean is taken.
-    width: of the tokens. num_blocks: rounds of attention. dropout: probability of dropping a unit.
-    The other arguments are `GraspEvaluator`'s.
+    Args:
+        width: Width of the tokens.
+        num_blocks: Rounds of attention.
+        dropout: Probability of dropping a unit.
+        image: Whether the convolutional pyramid is used.
+        depth: Whether the distance to the observed surface is used.
+        cloud: Whether the nearest point of the object is used.
+        table: Whether the height over the table is used.
+        motion: Whether the hand is looked at at all four waypoints, or at the grip alone.
+        attention: Whether tokens attend to each other and are pooled by attention; otherwise their mean is taken.
+        options: Arguments of `GraspEvaluator`.
     """
 
     architecture: ClassVar[str] = "em_fk"
@@ -63,16 +69,16 @@ class EMFK(GraspEvaluator):
         depth: bool = True,
         cloud: bool = True,
         table: bool = True,
-        way: bool = True,
+        motion: bool = True,
         attention: bool = True,
-        **training: Unpack[TrainingOptions],
+        **options: Unpack[EvaluatorOptions],
     ) -> None:
-        super().__init__(**training)
+        super().__init__(**options)
         self.width, self.num_blocks, self.dropout = width, num_blocks, dropout
         self.image, self.depth, self.cloud, self.table = image, depth, cloud, table
-        self.way, self.attention = way, attention
-        self.stages = STAGES if way else [GRIP]
-        self.register_buffer("points", torch.stack(surface_points(default_hand(), NUM_POINTS)), persistent=False)
+        self.motion, self.attention = motion, attention
+        self.stages = STAGES if motion else [GRIP]
+        self.register_buffer("points", torch.stack(surface_points(self.known_hands[0], NUM_POINTS)), persistent=False)
         shapes, stages = self.points.shape[1], len(self.stages)
         if image:
             self.pyramid = Pyramid(FEATURES["image"])
@@ -89,12 +95,15 @@ class EMFK(GraspEvaluator):
         self.query = nn.Linear(width, 1) if attention else None
         self.head = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Dropout(dropout), nn.Linear(width, 1))
 
-    def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Scene:
-        """Maps, cloud, where the upright frame is that they are told in, and the pyramid's features.
+    def encode(self, images: Float[Tensor, "view 2 224 224"]) -> Encoding:
+        """Maps, cloud, the upright frame that they are expressed in, and the pyramid's features.
 
-        The upright frame has its origin in the object's centre, z up and x along the camera's. "maps": depth of the
+        The upright frame has its origin in the object's center, z up and x along the camera's. "maps": depth of the
         surface, the object's share and normals (view, 5, 112, 112). "cloud": points and normals (view, 192, 6).
-        "axes": rotation from the camera's frame. "centre": the origin in it, and its height over the table (view, 4).
+        "axes": rotation from the camera's frame. "center": the origin in it, and its height over the table (view, 4).
+
+        Args:
+            images: Depth and height over the table in meters, 0 where the object is not; see `GraspEvaluator.encode`.
         """
         with torch.autocast(images.device.type, enabled=False), torch.no_grad():
             geometry = view_geometry(images.float())
@@ -103,27 +112,32 @@ class EMFK(GraspEvaluator):
             height = (geometry.points @ geometry.table[:, None, :3, None])[..., 0] + geometry.table[:, 3, None, None]
             turned = torch.einsum("vij,vjhw->vihw", axes, geometry.normals)
             maps = torch.cat((geometry.depth[:, None], geometry.mask[:, None], turned), 1)
-            scene = {
+            encoding = {
                 "maps": maps,
-                "cloud": torch.cat(((points - geometry.centre[:, None]) @ axes.mT, normals @ axes.mT), -1),
+                "cloud": torch.cat(((points - geometry.center[:, None]) @ axes.mT, normals @ axes.mT), -1),
                 "axes": axes,
-                "centre": geometry.centre_and_height,
+                "center": geometry.center_and_height,
             }
-            relative = ((maps[:, :1] - geometry.centre[:, 2, None, None, None]) / 0.1).clamp(-3, 3)
+            relative = ((maps[:, :1] - geometry.center[:, 2, None, None, None]) / 0.1).clamp(-3, 3)
             seen = torch.cat((relative, maps[:, 1:], height[:, None] / 0.1), 1)
         if self.image:
-            scene["features"], context = self.pyramid(seen)
-            scene["context"] = self.context(context)
-        return scene
+            encoding["features"], context = self.pyramid(seen)
+            encoding["context"] = self.context(context)
+        return encoding
 
-    def logit(self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]) -> Float[Tensor, "view grasp"]:
-        """Log-odds of success."""
-        with torch.autocast(grasps.device.type, enabled=False):  # a millimetre is beyond bfloat16
-            told = self.look({name: value.to(grasps) for name, value in scene.items()}, grasps)
-        point = F.gelu(self.point_out(F.gelu(self.point_in(told) + self.place)))
+    def logit(self, encoding: Encoding, grasps: Trajectory) -> Float[Tensor, "view grasp"]:
+        """Log-odds of success.
+
+        Args:
+            encoding: Result of `encode`.
+            grasps: Trajectories (view, grasp), in the frame of each view's aimed camera.
+        """
+        with torch.autocast(grasps.wrist.device.type, enabled=False):  # a millimeter is beyond bfloat16
+            features = self.look({name: value.to(grasps.wrist) for name, value in encoding.items()}, grasps)
+        point = F.gelu(self.point_out(F.gelu(self.point_in(features) + self.place)))
         x = self.token(point.transpose(2, 3).flatten(3)) + self.shape_embedding
         if self.image:
-            context = scene["context"].to(x)[:, None, None].expand(-1, x.shape[1], -1, -1)
+            context = encoding["context"].to(x)[:, None, None].expand(-1, x.shape[1], -1, -1)
             x = torch.cat((x, context), dim=2)
         views, count = x.shape[:2]
         x = x.flatten(0, 1)
@@ -134,41 +148,50 @@ class EMFK(GraspEvaluator):
         log_odds: Tensor = self.head(pooled).view(views, count)
         return log_odds
 
-    def look(
-        self, scene: Scene, grasps: Float[Tensor, "view grasp 10 28"]
-    ) -> Float[Tensor, "view grasp stage shape point feature"]:
-        """What each point tells, squashed to the order of one."""
-        hand = default_hand()
-        way = grasps[:, :, self.stages]
-        in_palm = hand.shape_poses(hand.forward_kinematics(way[..., JOINTS]))
-        points, normals = torch.einsum("vgwsij,asnj->avgwsni", in_palm[..., :3, :3], self.points.to(grasps))
+    def look(self, encoding: Encoding, grasps: Trajectory) -> Float[Tensor, "view grasp stage shape point feature"]:
+        """Features of the points on the hand, squashed to the order of one.
+
+        Args:
+            encoding: Result of `encode`, in the precision of the grasps.
+            grasps: As in `logit`.
+
+        Returns:
+            Features, at the stages of the motion at which the hand is placed.
+        """
+        hand, placed = self.known_hands[0], grasps.waypoint(self.stages)
+        in_palm = hand.shape_poses(hand.forward_kinematics(placed.joints))
+        points, normals = torch.einsum("vgwsij,asnj->avgwsni", in_palm[..., :3, :3], self.points.to(placed.wrist))
         points = points + in_palm[..., None, :3, 3]
         # into the upright frame, see `encode`; there height over the table is z, but for that of the origin
-        axes, centre = scene["axes"][:, None, None], scene["centre"][:, None, None]
-        origin = (axes @ (way[..., POSITION] - centre[..., :3])[..., None]).mT
-        turn = (axes @ rotation.to_matrix(rotation.normalize(way[..., QUATERNION]))).mT
+        axes, center = encoding["axes"][:, None, None], encoding["center"][:, None, None]
+        origin = (axes @ (placed.position - center[..., :3])[..., None]).mT
+        turn = (axes @ rotation.to_matrix(rotation.normalize(placed.quaternion))).mT
         p = (points.flatten(3, 4) @ turn + origin).flatten(1, -2)  # (view, grasp * stage * shape * point, 3)
         n = (normals.flatten(3, 4) @ turn).flatten(1, -2)
-        told = [p / 0.1, n, points.flatten(1, -2) / 0.1]
+        features = [p / 0.1, n, points.flatten(1, -2) / 0.1]
         if self.table:
-            height = p[..., 2:] + scene["centre"][:, None, 3:]
-            told.append(torch.cat((torch.tanh(height / NEAR), torch.tanh(height / 0.2)), -1))
+            height = p[..., 2:] + encoding["center"][:, None, 3:]
+            features.append(torch.cat((torch.tanh(height / NEAR), torch.tanh(height / 0.2)), -1))
         if self.depth or self.image:
-            in_camera = p @ scene["axes"] + scene["centre"][:, None, :3]
+            in_camera = p @ encoding["axes"] + encoding["center"][:, None, :3]
             pixel = project(in_camera)
         if self.depth:
-            ray = (in_camera / in_camera[..., 2:].clamp_min(MIN_DEPTH)) @ scene["axes"].mT
-            told.append(before_surface(in_camera[..., 2:], ray, n, sample(scene["maps"], pixel)))
+            ray = (in_camera / in_camera[..., 2:].clamp_min(MIN_DEPTH)) @ encoding["axes"].mT
+            features.append(before_surface(in_camera[..., 2:], ray, n, sample(encoding["maps"], pixel)))
         if self.cloud:
-            told.append(nearest(p, n, scene["cloud"]))
+            features.append(nearest(p, n, encoding["cloud"]))
         if self.image:
-            told.append(sample(scene["features"], pixel))
-        features: Tensor = torch.cat(told, -1).unflatten(1, points.shape[1:-1])
-        return features
+            features.append(sample(encoding["features"], pixel))
+        every: Tensor = torch.cat(features, -1).unflatten(1, points.shape[1:-1])
+        return every
 
 
 class Pyramid(nn.Module):
-    """A small convolutional pyramid over the maps of a view, with one fine output (Lin et al. 2017)."""
+    """A small convolutional pyramid over the maps of a view, with one fine output (Lin et al. 2017).
+
+    Args:
+        channels: Channels of the output.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -183,7 +206,11 @@ class Pyramid(nn.Module):
     def forward(
         self, x: Float[Tensor, "view 6 112 112"]
     ) -> tuple[Float[Tensor, "view channel 56 56"], Float[Tensor, "view context"]]:
-        """Features at every second pixel, and the mean of the coarsest."""
+        """Features at every second pixel, and the mean of the coarsest.
+
+        Args:
+            x: Maps of the views.
+        """
         levels = []
         for stage in self.down:
             x = stage(x)
@@ -195,7 +222,13 @@ class Pyramid(nn.Module):
 
 
 class Block(nn.Module):
-    """A pre-norm transformer block; without attention each token goes alone (Xiong et al. 2020)."""
+    """A pre-norm transformer block (Xiong et al. 2020).
+
+    Args:
+        width: Width of the tokens.
+        dropout: Probability of dropping a unit.
+        attention: Whether tokens attend to each other.
+    """
 
     def __init__(self, width: int, dropout: float, attention: bool) -> None:
         super().__init__()
@@ -206,7 +239,11 @@ class Block(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "batch token width"]) -> Float[Tensor, "batch token width"]:
-        """Tokens after one round."""
+        """Tokens after one round.
+
+        Args:
+            x: Tokens before it.
+        """
         if self.attend is not None:
             y = self.norms[0](x)
             x = x + self.attend(y, y, y, need_weights=False)[0]
@@ -219,14 +256,23 @@ def _convolution(before: int, after: int, stride: int) -> list[nn.Module]:
 
 
 def project(p: Float[Tensor, "view point 3"]) -> Float[Tensor, "view point 2"]:
-    """Places in the image, -1 to 1 over the pixels' outer borders."""
+    """Places in the image, -1 to 1 over the pixels' outer borders.
+
+    Args:
+        p: Points in the frame of the aimed camera, meters.
+    """
     camera = Camera.aimed()
     z = p[..., 2:].clamp_min(MIN_DEPTH)
     return p[..., :2] / z * (2 * camera.fx / camera.width)  # the principal point is the image's middle
 
 
 def sample(maps: Float[Tensor, "view channel row column"], pixel: Float[Tensor, "view point 2"]) -> Tensor:
-    """(view, point, channel) bilinear values; outside the image those at its border."""
+    """(view, point, channel) bilinear values; outside the image those at its border.
+
+    Args:
+        maps: Maps of the views.
+        pixel: Places, as of `project`.
+    """
     values = F.grid_sample(maps, pixel[:, None], padding_mode="border", align_corners=False)
     return values[:, :, 0].mT
 
@@ -234,7 +280,11 @@ def sample(maps: Float[Tensor, "view channel row column"], pixel: Float[Tensor, 
 def before_surface(z: Tensor, ray: Tensor, n: Tensor, seen: Tensor) -> Tensor:
     """Gap to the surface along the ray, at two scales, and along its normal; object or table; how normals meet.
 
-    z: (view, point, 1) depth of the points; ray: (view, point, 3) directions to them, of depth 1.
+    Args:
+        z: Depth of the points in meters, (view, point, 1).
+        ray: Directions to them, of depth 1, (view, point, 3).
+        n: Outward normals of the hand at them, (view, point, 3).
+        seen: Values of the maps at their pixels, (view, point, 5).
     """
     depth, mask, normal = seen[..., :1], seen[..., 1:2], seen[..., 2:]
     gap = depth - z
@@ -244,7 +294,13 @@ def before_surface(z: Tensor, ray: Tensor, n: Tensor, seen: Tensor) -> Tensor:
 
 
 def nearest(p: Tensor, n: Tensor, seen: Float[Tensor, "view cloud 6"]) -> Tensor:
-    """Distance to the nearest observed point at two scales, whether it is faced, its surface's side and normal."""
+    """Distance to the nearest observed point at two scales, whether it is faced, its surface's side and normal.
+
+    Args:
+        p: Points on the hand in the upright frame, meters, (view, point, 3).
+        n: Their outward normals.
+        seen: Observed points and their normals.
+    """
     rows = torch.stack([nearest_rows(a, b) for a, b in zip(p, seen[..., :3], strict=True)])
     found = seen.take_along_dim(rows[..., None], dim=1)
     offset, normal = found[..., :3] - p, found[..., 3:]
@@ -259,7 +315,12 @@ def nearest(p: Tensor, n: Tensor, seen: Float[Tensor, "view cloud 6"]) -> Tensor
 
 @torch.no_grad()
 def nearest_rows(p: Float[Tensor, "point 3"], cloud: Float[Tensor, "cloud 3"]) -> Tensor:
-    """(point,) rows of the nearest in a cloud that lies about the origin, part by part."""
+    """(point,) rows of the nearest in a cloud that lies about the origin, part by part.
+
+    Args:
+        p: Points, meters.
+        cloud: The cloud, meters.
+    """
     half = -0.5 * cloud.square().sum(1)
     return torch.cat([_argmax(torch.addmm(half, part, cloud.mT)) for part in p.split(_PART)])
 

@@ -24,9 +24,13 @@ LITE0_BLOCKS = (
 
 
 class Trunk(NamedTuple):
-    """channels: of its last feature map. scale: standard deviation of the images it was trained on.
+    """A pretrained trunk.
 
-    weights: the name of a file that comes with dexzoo, or what gives them.
+    Attributes:
+        channels: Channels of its last feature map.
+        scale: Standard deviation of the images that it was trained on.
+        build: Makes the network.
+        weights: Name of a file that comes with dexzoo, or a function that fetches the weights.
     """
 
     channels: int
@@ -50,8 +54,15 @@ def _resnet50() -> nn.Module:
 class InvertedResidual(nn.Module):
     """Widen, convolve each channel, narrow; ReLU6 after the first two (Sandler et al. 2018).
 
-    Each convolution has taken up its batch normalisation. With stride 2 it pads as TensorFlow does: the odd row and
+    Each convolution has taken up its batch normalization. With stride 2 it pads as TensorFlow does: the odd row and
     column at the end.
+
+    Args:
+        before: Channels of the input.
+        after: Channels of the output.
+        kernel: Size of the kernels.
+        stride: Stride of the convolution of each channel.
+        expansion: Factor by which it widens.
     """
 
     def __init__(self, before: int, after: int, kernel: int, stride: int, expansion: int) -> None:
@@ -68,7 +79,11 @@ class InvertedResidual(nn.Module):
         self.shortcut = stride == 1 and before == after
 
     def forward(self, x: Float[Tensor, "view before row column"]) -> Float[Tensor, "view after row2 column2"]:
-        """The block's output."""
+        """The block's output.
+
+        Args:
+            x: Feature map.
+        """
         out: Tensor = self.layers(x)
         return x + out if self.shortcut else out
 
@@ -99,7 +114,10 @@ def _shipped(name: str) -> dict[str, Tensor]:
 def pack(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Weights as a file keeps them in a quarter of the space: int8 with a scale for each output channel.
 
-    Vectors, such as those of normalisations, stay: in float16, or as they are where they are integers.
+    Vectors, such as those of normalizations, stay: in float16, or as they are if they are integers.
+
+    Args:
+        weights: Tensors by name.
     """
     packed: dict[str, Tensor] = {}
     for name, value in weights.items():
@@ -134,16 +152,31 @@ trained on rendered views by assets/checkpoints/train_resnet50.py. All but the f
 
 
 def trunk(name: str) -> Trunk:
-    """What is known of a trunk. ValueError with all names for one that is not known."""
+    """A trunk by its name.
+
+    Args:
+        name: A name in `TRUNKS`.
+
+    Raises:
+        ValueError: The name is unknown.
+    """
     if name not in TRUNKS:
         raise ValueError(f"trunk {name!r} is unknown; use one of {', '.join(TRUNKS)}")
     return TRUNKS[name]
 
 
 def trunk_card(name: str) -> dict[str, Any] | None:
-    """What the card of a trunk that comes with dexzoo says, such as source and licence; None for one that is fetched.
+    """Card of a trunk that comes with dexzoo, with source and license.
 
-    Raises ValueError for another name, FileNotFoundError where its file is missing.
+    Args:
+        name: A name in `TRUNKS`.
+
+    Returns:
+        The card; None for a trunk that is fetched.
+
+    Raises:
+        FileNotFoundError: The card is missing.
+        ValueError: The name is unknown.
     """
     file = trunk(name).weights
     if not isinstance(file, str):
@@ -153,7 +186,11 @@ def trunk_card(name: str) -> dict[str, Any] | None:
 
 
 def trunk_bytes(name: str) -> int:
-    """Size of the file that a trunk comes in, or, of one that is fetched, of its weights in memory."""
+    """Size of the file that a trunk comes in, or of the weights in memory if it is fetched.
+
+    Args:
+        name: A name in `TRUNKS`.
+    """
     file = trunk(name).weights
     if isinstance(file, str):
         return (resource("checkpoints") / f"{file}.safetensors").stat().st_size
@@ -164,11 +201,16 @@ def trunk_bytes(name: str) -> int:
 def load_trunk(name: str) -> nn.Module:
     """A trunk with its weights, frozen; one copy of each is shared by all models.
 
-    Raises ValueError for another name, FileNotFoundError where weights cannot be had.
+    Args:
+        name: A name in `TRUNKS`.
+
+    Raises:
+        FileNotFoundError: The weights are missing or cannot be fetched.
+        ValueError: The name is unknown.
     """
     known = trunk(name)
     weights = _shipped(known.weights) if isinstance(known.weights, str) else known.weights()
-    with torch.device("meta"):  # torchvision would draw millions of random weights that nobody needs
+    with torch.device("meta"):  # torchvision would draw millions of random weights in vain
         network = known.build()
     network.load_state_dict(
         {key: value.float() if value.is_floating_point() else value for key, value in weights.items()}, assign=True

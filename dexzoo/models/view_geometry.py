@@ -13,29 +13,32 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from dexzoo.camera import Camera
+from dexzoo.perception.camera import Camera
 
 MAP_SIZE = 112
 """Pixels of the maps in each direction: half the image's, which averages the sensor's noise."""
 SMOOTHING = 5
-"""Pixels of the window that normals are taken from; 18 mm at half a metre."""
+"""Pixels of the window that normals are taken from; 18 mm at half a meter."""
 MAX_DEPTH = 2.0
 _RIDGE = 1e-12
 
 
 class ViewGeometry(NamedTuple):
-    """What is known of the surface in each view; metres.
+    """Geometry of the surface in each view; meters.
 
-    depth: (view, 112, 112) of the first surface along each pixel's ray: the object's, else the table's.
-    mask: (view, 112, 112) share of the pixel that the object covers. normals: (view, 3, 112, 112) unit, to the camera.
-    table: (view, 4) plane, normal . p + offset = height. centre: (view, 3) mean of the object's points.
+    Attributes:
+        depth: Depth of the first surface along each pixel's ray: the object's, else the table's, (view, 112, 112).
+        mask: Share of the pixel that the object covers, (view, 112, 112).
+        normals: Unit normals, towards the camera, (view, 3, 112, 112).
+        table: Plane of the table, normal . p + offset = height, (view, 4).
+        center: Mean of the object's points, (view, 3).
     """
 
     depth: Tensor
     mask: Tensor
     normals: Tensor
     table: Tensor
-    centre: Tensor
+    center: Tensor
 
     @property
     def points(self) -> Float[Tensor, "view 112 112 3"]:
@@ -43,27 +46,31 @@ class ViewGeometry(NamedTuple):
         return _rays(MAP_SIZE).to(self.depth) * self.depth[..., None]
 
     @property
-    def centre_and_height(self) -> Float[Tensor, "view 4"]:
-        """The object's centre, and its height over the table."""
-        height = (self.centre * self.table[:, :3]).sum(1, keepdim=True) + self.table[:, 3:]
-        return torch.cat((self.centre, height), 1)
+    def center_and_height(self) -> Float[Tensor, "view 4"]:
+        """The object's center, and its height over the table."""
+        height = (self.center * self.table[:, :3]).sum(1, keepdim=True) + self.table[:, 3:]
+        return torch.cat((self.center, height), 1)
 
 
 def view_geometry(images: Float[Tensor, "view 2 224 224"]) -> ViewGeometry:
-    """Of images as evaluators get them: the object's depth and height over the table, 0 elsewhere."""
+    """Geometry of images as evaluators get them.
+
+    Args:
+        images: The object's depth and its height over the table in meters, 0 elsewhere.
+    """
     table = table_plane(images)
     seen = F.avg_pool2d((images[:, :1] > 0).to(images), 2)
     depth = F.avg_pool2d(images[:, :1], 2) / seen.clamp_min(0.25)
     rays = _rays(MAP_SIZE).to(images)
     points = rays.movedim(-1, 0) * depth
     weight = seen.sum((2, 3)).clamp_min(1)
-    centre = (points * seen).sum((2, 3)) / weight
+    center = (points * seen).sum((2, 3)) / weight
     slope = torch.einsum("hwi,vi->vhw", rays, table[:, :3])
     fall = torch.maximum(-slope, table[:, 3, None, None] / MAX_DEPTH)
     ground = table[:, 3, None, None] / fall
     mask = seen[:, 0]
     normals = torch.where(seen > 0, _normals(points, seen, rays), table[:, :3, None, None])
-    return ViewGeometry(torch.where(mask > 0, depth[:, 0], ground), mask, normals, table, centre)
+    return ViewGeometry(torch.where(mask > 0, depth[:, 0], ground), mask, normals, table, center)
 
 
 def table_plane(images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view 4"]:
@@ -71,6 +78,9 @@ def table_plane(images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view 
 
     Least squares over the object's pixels. The aimed camera stands upright, so the normal has no x component; points
     in one plane leave the rest open by a line, on which a faint pull to a camera 45 degrees high decides.
+
+    Args:
+        images: As in `view_geometry`.
     """
     depth, height = images.flatten(2).double().unbind(1)
     rays = _rays(images.shape[-1]).to(depth).flatten(0, 1)
@@ -90,7 +100,11 @@ def table_plane(images: Float[Tensor, "view 2 224 224"]) -> Float[Tensor, "view 
 
 
 def upright_axes(table: Float[Tensor, "view 4"]) -> Float[Tensor, "view 3 3"]:
-    """Rotations from the camera's frame to one with z up, x along the camera's and y level and away from it."""
+    """Rotations from the camera's frame to one with z up, x along the camera's and y level and away from it.
+
+    Args:
+        table: Planes of the table, as of `table_plane`.
+    """
     up = table[:, :3]
     right = torch.eye(3)[0].to(table).expand_as(up)
     return torch.stack((right, torch.cross(up, right, dim=-1), up), dim=1)
@@ -101,6 +115,10 @@ def cloud(geometry: ViewGeometry, count: int) -> Float[Tensor, "view {count} 6"]
 
     Every so-many-th of the object's pixels along a curve that fills the plane (Morton 1966) is taken, which needs no
     search and is as even as the pixels are; small objects repeat some.
+
+    Args:
+        geometry: Geometry of the views.
+        count: Number of points.
     """
     order = _morton(MAP_SIZE).to(geometry.mask.device)
     rank = (geometry.mask.flatten(1)[:, order] > 0).long().cumsum(1)

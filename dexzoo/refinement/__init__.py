@@ -1,20 +1,32 @@
-"""Refinement: better grasps near those that were proposed, judged by evaluators alone; the simulator is not asked.
+"""Refinement: better grasps near those that were proposed, by evaluators alone; the simulator is not asked.
 
-method.py      `refine`: propose by climbing, accept what rose, and what a second evaluator agrees to
-climb.py       one climb: variables, objective and optimiser brought together, chunk by chunk
-variables.py   what may be moved, within the trust region by construction
-objective.py   what is climbed: log-odds, prior, penalties, and their weights
-penalties.py   the terms of it that come from the hand, the view and the generator
-optimisers.py  Adam, L-BFGS, Metropolis-Hastings, random
+refinement.py  `refine`: climb, and accept a grasp that rose, if no term and no judge objects
+terms.py       the terms of the objective: log-odds, prior, penalties, or one of your own
+objective.py   the weighted sum of terms
+variables.py   the numbers that are moved, and the trust region
+posed_hand.py  the hand at some waypoints, which terms look at
+optimizers.py  Adam, L-BFGS, Metropolis-Hastings, random
+climb.py       one climb: variables, objective and optimizer together, chunk by chunk
 ranking.py     how refined grasps are ranked
-thesis.py      the thesis' groups A, B and C, to be compared with
 """
 
 from dexzoo.refinement.climb import Trace
-from dexzoo.refinement.method import Refinement, refine
-from dexzoo.refinement.objective import Weights
-from dexzoo.refinement.optimisers import OPTIMISERS
+from dexzoo.refinement.objective import Objective
+from dexzoo.refinement.optimizers import OPTIMIZERS
 from dexzoo.refinement.ranking import RANKINGS, rank
-from dexzoo.refinement.variables import Region
+from dexzoo.refinement.refinement import Refinement, refine
+from dexzoo.refinement.terms import Term, default_terms
+from dexzoo.refinement.trust_region import TrustRegion
 
-__all__ = ["OPTIMISERS", "RANKINGS", "Refinement", "Region", "Trace", "Weights", "rank", "refine"]
+__all__ = [
+    "OPTIMIZERS",
+    "RANKINGS",
+    "Objective",
+    "Refinement",
+    "Term",
+    "Trace",
+    "TrustRegion",
+    "default_terms",
+    "rank",
+    "refine",
+]

@@ -1,4 +1,4 @@
-"""One climb: grasps, what may be moved of them, an optimiser; out come the best states, and what they are worth."""
+"""One climb: grasps, the variables that move them and an optimizer give the best states found, and their values."""
 
 from __future__ import annotations
 
@@ -14,43 +14,47 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dexzoo.refinement.objective import Objective, Terms
-from dexzoo.refinement.optimisers import BY_GRADIENT, OPTIMISERS, Draws, Search
-from dexzoo.refinement.variables import VARIABLES, Region, Variables, make_variables
+from dexzoo.grasp import Trajectory
+from dexzoo.refinement.objective import Objective, Values
+from dexzoo.refinement.optimizers import BY_GRADIENT, OPTIMIZERS, Draws, Search
+from dexzoo.refinement.trust_region import TrustRegion
+from dexzoo.refinement.variables import MakeVariables, Variables
 
 CHUNK = 50
-"""Grasps in work together; bounds each thread's memory, and keeps what lies between layers in cache."""
+"""Grasps in work together; bounds each thread's memory, and keeps activations in cache."""
 OnStep = Callable[[int, Float[Tensor, " grasp"]], None]
 
 
 @dataclass(frozen=True)
 class Trace:
-    """All that was tried, step by step, the given grasps first.
+    """All states that were tried, step by step, the given grasps first.
 
-    waypoints: (step, grasp, 10, 28) in the frame of the grasps. objective: (step, grasp), -inf where it was no number.
+    Attributes:
+        grasps: Trajectories in the world frame, (step, grasp).
+        objective: Their objective, -inf where it was no number, (step, grasp).
     """
 
-    waypoints: Float[Tensor, "step grasp 10 28"]
+    grasps: Trajectory
     objective: Float[Tensor, "step grasp"]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How to climb: arguments of `dexzoo.refine`, explained there. Raises ValueError for what they cannot be."""
+    """How to climb: arguments of `dexzoo.refine`, explained there.
 
-    optimiser: str
-    variables: str
-    region: Region
+    Raises:
+        ValueError: A value cannot be used.
+    """
+
+    optimizer: str
+    make_variables: MakeVariables
+    trust_region: TrustRegion
     num_steps: int
     step_size: float
 
     def __post_init__(self) -> None:
-        for what, value, known in (
-            ("optimiser", self.optimiser, tuple(OPTIMISERS)),
-            ("variables", self.variables, VARIABLES),
-        ):
-            if value not in known:
-                raise ValueError(f"{what} {value!r} is unknown, use one of {', '.join(known)}")
+        if self.optimizer not in OPTIMIZERS:
+            raise ValueError(f"optimizer {self.optimizer!r} is unknown, use one of {', '.join(OPTIMIZERS)}")
         if not isinstance(self.num_steps, Integral) or self.num_steps < 0:
             raise ValueError(f"num_steps is {self.num_steps}, expected a whole number, 0 or more")
         if not 0 < self.step_size <= 1:
@@ -61,14 +65,20 @@ class Settings:
 
 @dataclass(frozen=True)
 class Climb:
-    """What came of some grasps: waypoints in the world frame, terms of the given and of these, by how much they rose.
+    """The result of a climb.
 
-    failed: whether the objective was no finite number on the way. trace: in the world frame, if asked for.
+    Attributes:
+        grasps: The best states found, world frame.
+        before: Values of the terms of the given grasps.
+        after: Values of the terms of the best states.
+        rise: By how much the objective rose.
+        failed: Whether the objective was no finite number on the way.
+        trace: All states, if asked for.
     """
 
-    waypoints: Float[Tensor, "grasp 10 28"]
-    before: Terms
-    after: Terms
+    grasps: Trajectory
+    before: Values
+    after: Values
     rise: Float[Tensor, " grasp"]
     failed: Bool[Tensor, " grasp"]
     trace: Trace | None
@@ -76,18 +86,30 @@ class Climb:
 
 def climb(
     objective: Objective,
-    waypoints: Float[Tensor, "grasp 10 28"],
+    grasps: Trajectory,
     settings: Settings,
     seed: int,
     keep_trace: bool = False,
     on_step: OnStep | None = None,
 ) -> Climb:
-    """Climb from waypoints in the world frame, at most `CHUNK` grasps together.
+    """Climb from some grasps, at most `CHUNK` of them together.
 
     Each of torch's threads takes chunks of its own: threads that share small operators gain little by it.
+
+    Args:
+        objective: The objective.
+        grasps: Grasps in the world frame; at least one.
+        settings: How to climb.
+        seed: Seed of the random optimizers.
+        keep_trace: Whether all states are kept.
+        on_step: Called with the step and the objective of a chunk, from one thread at a time.
+
+    Returns:
+        The best states.
     """
-    threads, num_chunks = torch.get_num_threads(), math.ceil(len(waypoints) / CHUNK)
-    seeds = torch.randint(2**62, (len(waypoints),), generator=torch.Generator().manual_seed(seed))
+    threads, num_chunks = torch.get_num_threads(), math.ceil(len(grasps) / CHUNK)
+    seeds = torch.randint(2**62, (len(grasps),), generator=torch.Generator().manual_seed(seed))
+    size = math.ceil(len(grasps) / num_chunks)
     workers = min(threads, num_chunks)
     run = partial(_climb_chunk, objective, settings, keep_trace, None if on_step is None else _one_by_one(on_step))
     started = Barrier(workers + 1)
@@ -97,7 +119,7 @@ def climb(
         started.wait()
 
     with ThreadPoolExecutor(workers, initializer=start) as pool:
-        parts = pool.map(run, waypoints.chunk(num_chunks), seeds.chunk(num_chunks))
+        parts = pool.map(run, grasps.split(size), seeds.split(size))
         started.wait()
         torch.set_num_threads(threads)  # for threads to come, which would take after the pool's
         return _join(list(parts))
@@ -106,64 +128,64 @@ def climb(
 def _one_by_one(on_step: OnStep) -> OnStep:
     lock = Lock()
 
-    def told(step: int, value: Tensor) -> None:
+    def locked(step: int, value: Tensor) -> None:
         with lock:
             on_step(step, value)
 
-    return told
+    return locked
 
 
 def _climb_chunk(
-    objective: Objective, settings: Settings, keep_trace: bool, on_step: OnStep | None, given: Tensor, seeds: Tensor
+    objective: Objective, settings: Settings, keep_trace: bool, on_step: OnStep | None, given: Trajectory, seeds: Tensor
 ) -> Climb:
-    moved = make_variables(settings.variables, given, objective.hand, settings.region)
+    variables = settings.make_variables(given, objective.hand, settings.trust_region)
     generators = [torch.Generator().manual_seed(seed) for seed in seeds.tolist()]
-    states: list[Tensor] = []
-    values: list[Tensor] = []
+    states: list[Trajectory] = [given]
+    objectives: list[Tensor] = []
 
-    def told(state: Tensor, value: Tensor) -> None:
+    def on_state(state: Tensor, value: Tensor) -> None:
         if on_step is not None:
-            on_step(len(values), value)
-        values.append(value)
-        if keep_trace:
-            states.append(moved(state))
+            on_step(len(objectives), value)
+        if keep_trace and objectives:
+            states.append(variables(state))
+        objectives.append(value)
 
-    terms_near = objective.near(given)
+    values_near = objective.near(given)
     with torch.no_grad():
-        before = terms_near(given)
-    value = objective.value(before)
-    told(moved.start, torch.where(torch.isfinite(value), value, -torch.inf))
-    best, failed, after = moved.start, torch.zeros(len(given), dtype=torch.bool), before
+        before = values_near(given)
+    start = objective.total(before)
+    on_state(variables.start, torch.where(torch.isfinite(start), start, -torch.inf))
+    best, failed, after = variables.start, torch.zeros(len(given), dtype=torch.bool), before
     later = settings.num_steps // 2
-    for moves, num_steps in zip(moved.stages, (settings.num_steps - later, later), strict=True):
+    for moves, num_steps in zip(variables.stages, (settings.num_steps - later, later), strict=True):
         if not num_steps:
             continue
-        if best is not moved.start:  # what is near may no longer be
-            terms_near = objective.near(moved(best))
-        evaluate = partial(_evaluate, objective, terms_near, moved)
-        search = Search(evaluate, best, settings.optimiser in BY_GRADIENT, told)
+        if best is not variables.start:  # points that were near may no longer be
+            values_near = objective.near(variables(best))
+        evaluate = partial(_evaluate, objective, values_near, variables)
+        search = Search(evaluate, best, settings.optimizer in BY_GRADIENT, on_state)
         draws = Draws.draw(num_steps, len(moves), generators)
-        OPTIMISERS[settings.optimiser](search, moves, num_steps, settings.step_size, draws)
-        best, failed, after = search.best, failed | search.failed, search.terms
-    rise = objective.value(after) - value
-    trace = Trace(torch.stack([given, *states[1:]]), torch.stack(values)) if keep_trace else None
-    return Climb(moved(best), before, after, rise, failed, trace)
+        OPTIMIZERS[settings.optimizer](search, moves, num_steps, settings.step_size, draws)
+        best, failed, after = search.best, failed | search.failed, search.values
+    rise = objective.total(after) - start
+    trace = Trace(Trajectory.stack(states), torch.stack(objectives)) if keep_trace else None
+    return Climb(variables(best), before, after, rise, failed, trace)
 
 
 def _evaluate(
-    objective: Objective, terms_near: Callable[[Tensor], Terms], moved: Variables, state: Tensor
-) -> tuple[Tensor, Terms]:
-    terms = terms_near(moved(state))
-    return objective.value(terms), terms
+    objective: Objective, values_near: Callable[[Trajectory], Values], variables: Variables, state: Tensor
+) -> tuple[Tensor, Values]:
+    values = values_near(variables(state))
+    return objective.total(values), values
 
 
 def _join(parts: list[Climb]) -> Climb:
     traces = [part.trace for part in parts if part.trace is not None]
     trace = None
     if traces:
-        trace = Trace(torch.cat([t.waypoints for t in traces], 1), torch.cat([t.objective for t in traces], 1))
+        trace = Trace(Trajectory.cat([t.grasps for t in traces], 1), torch.cat([t.objective for t in traces], 1))
     return Climb(
-        torch.cat([part.waypoints for part in parts]),
+        Trajectory.cat([part.grasps for part in parts]),
         {name: torch.cat([part.before[name] for part in parts]) for name in parts[0].before},
         {name: torch.cat([part.after[name] for part in parts]) for name in parts[0].after},
         torch.cat([part.rise for part in parts]),

@@ -1,104 +1,75 @@
-"""What refinement climbs: log-odds of success, what speaks for them, and what a grasp pays for."""
+"""The objective of refinement: a weighted sum of terms."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Callable, Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dexzoo.camera import Observation
-from dexzoo.generators.density import GraspDensity
+from dexzoo.grasp import Trajectory
 from dexzoo.hand import Hand
-from dexzoo.models.evaluator import PreparedView
-from dexzoo.refinement.penalties import AT_OBJECT, WAY, Posed, Prior, Surroundings
+from dexzoo.perception import View
+from dexzoo.refinement.posed_hand import PosedHand
+from dexzoo.refinement.terms import Term
 
-_TOGETHER = 8
-"""Grasps whose whole ways are looked at together, with all points near them; bounds memory."""
-Terms = dict[str, Float[Tensor, " grasp"]]
-"""log_odds, and the terms of `Weights` that are asked for, by name."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Log-odds, as the evaluator gives them before calibration, that a unit of each term counts; 0 leaves a term out.
-
-    spread: standard deviation of log-odds among an ensemble's members. prior: the generator's log-density of the grip.
-    penetration, shadow: metres of observed points, and of what hides behind them, in the links. table: metres that
-    links come too near to the table or to what stands on it. self_collision: metres that links overlap.
-    The prior is added, the others are subtracted. Raises ValueError for a negative weight.
-    """
-
-    spread: float = 1.0
-    prior: float = 0.05
-    penetration: float = 50.0
-    shadow: float = 15.0
-    table: float = 300.0
-    self_collision: float = 50.0
-
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not 0 <= value < torch.inf:
-                raise ValueError(f"the weight of {name} is {value}, expected 0 or more")
+Values = dict[str, Float[Tensor, " grasp"]]
+"""Values of the terms by their names."""
 
 
 class Objective:
-    """log-odds - spread + prior - penalties of waypoints in the world frame, on one view.
+    """A sum of terms on one view.
 
-    density: the generator's, needed where the prior has a weight.
+    Args:
+        terms: The terms; at least one.
+        view: The view of the object.
+        hand: The hand.
+
+    Raises:
+        ValueError: There is no term, or two have one name.
     """
 
-    def __init__(
-        self, view: PreparedView, observation: Observation, hand: Hand, weights: Weights, density: GraspDensity | None
-    ) -> None:
-        self.view, self.hand, self.weights, self.density = view, hand, weights, density
-        self.surroundings = Surroundings(observation)
+    def __init__(self, terms: Sequence[Term], view: View, hand: Hand) -> None:
+        names = [term.name for term in terms]
+        if not names or len(set(names)) < len(names):
+            raise ValueError(
+                f"the terms are {', '.join(names) or 'none'}; give at least one, each with a name of its own"
+            )
+        self.terms, self.view, self.hand = list(terms), view, hand
 
-    def near(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Callable[[Tensor], Terms]:
-        """The terms as a function of waypoints that stay near these: differentiable, grasp by grasp."""
-        weights, around = self.weights, self.surroundings
-        posed = Posed(self.hand, waypoints)
-        looked: dict[str, Callable[[Posed], Tensor]] = {}
-        if weights.penetration:
-            looked["penetration"] = partial(Posed.penetration, near=posed.nearest(around.observed, AT_OBJECT))
-        if weights.shadow:
-            looked["shadow"] = partial(Posed.penetration, near=posed.nearest(around.shadow, AT_OBJECT))
-        if weights.table:
-            looked["table"] = partial(Posed.table, near=posed.nearest(around.others))
-        if weights.self_collision:
-            looked["self_collision"] = Posed.self_collision
-        prior = Prior(self.density, waypoints) if weights.prior and self.density else None
+    def near(self, grasps: Trajectory) -> Callable[[Trajectory], Values]:
+        """The values of all terms as a function of grasps that stay near these; differentiable, grasp by grasp.
 
-        def terms(waypoints: Tensor) -> Terms:
-            if weights.spread:
-                logit, spread = self.view.logit_and_spread(waypoints)
-                found = {"log_odds": logit, "spread": spread}
-            else:
-                found = {"log_odds": self.view.logit(waypoints)}
-            if prior is not None:
-                found["prior"] = prior(waypoints)
-            if looked:
-                now = Posed(self.hand, waypoints)
-                found |= {name: look(now) for name, look in looked.items()}
-            return found
+        Args:
+            grasps: Grasps in the world frame.
+        """
+        hands = PosedHand(self.hand, grasps)
+        values = {term.name: term.near(self.view, hands) for term in self.terms}
 
-        return terms
+        def evaluate(moved: Trajectory) -> Values:
+            now = PosedHand(self.hand, moved)
+            return {name: value(now) for name, value in values.items()}
 
-    @torch.no_grad()
-    def lacks(self, waypoints: Float[Tensor, "grasp 10 28"]) -> Float[Tensor, " grasp"]:
-        """The term "table" on the whole way to the grip; 0 where it has no weight."""
-        if not self.weights.table:
-            return waypoints.new_zeros(len(waypoints))
-        every = self.surroundings.others[None, None]
-        return torch.cat([Posed(self.hand, part, WAY).table(every) for part in waypoints.split(_TOGETHER)])
+        return evaluate
 
-    def value(self, terms: Terms) -> Float[Tensor, " grasp"]:
-        """What the terms add up to."""
-        total = terms["log_odds"]
-        for name, weight in asdict(self.weights).items():
-            if name in terms:
-                total = total + (weight if name == "prior" else -weight) * terms[name]
-        return total
+    def total(self, values: Values) -> Float[Tensor, " grasp"]:
+        """The weighted sum.
+
+        Args:
+            values: Values of the terms.
+        """
+        first, *others = (term.weight * values[term.name] for term in self.terms)
+        return sum(others, first)
+
+    def accepts(self, before: Trajectory, after: Trajectory) -> Bool[Tensor, " grasp"]:
+        """Whether no term objects to a replacement.
+
+        Args:
+            before: The given grasps.
+            after: Their replacements.
+        """
+        accepted = torch.ones(len(before), dtype=torch.bool)
+        for term in self.terms:
+            accepted &= term.accepts(self.view, self.hand, before, after)
+        return accepted

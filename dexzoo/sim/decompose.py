@@ -1,4 +1,4 @@
-"""Convex parts of a mesh by CoACD (Wei et al. 2022), as a program of its own: what it does to a bad mesh stays there.
+"""Convex parts of a mesh by CoACD (Wei et al. 2022), in a process of its own, since a bad mesh can crash it.
 
 python decompose.py MESH.npz PARTS.npz, where MESH holds vertices and faces, and PARTS vertices_0, faces_0, ...
 """
@@ -12,7 +12,12 @@ MAX_PARTS = 24
 
 
 def main(source: str, target: str) -> None:
-    """Read, cut, write."""
+    """Read, cut, write.
+
+    Args:
+        source: File of the mesh.
+        target: File for the parts.
+    """
     mesh = np.load(source)
     coacd.set_log_level("error")
     surface = coacd.Mesh(mesh["vertices"], mesh["faces"])

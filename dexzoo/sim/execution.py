@@ -1,4 +1,4 @@
-"""Grasps under way in MuJoCo: many copies of one scene that each follow a motion of their own."""
+"""Execution of grasps in MuJoCo: many copies of one scene that each follow a motion of their own."""
 
 from __future__ import annotations
 
@@ -12,20 +12,24 @@ from numpy.typing import NDArray
 
 from dexzoo import rotation
 from dexzoo.grasp import Grasps
-from dexzoo.hand import Hand
-from dexzoo.sim.motion import LIFT_START, Motion
+from dexzoo.sim.protocol import LIFT_START, Motion
 from dexzoo.sim.robot import to_quaternion
 from dexzoo.sim.scene import Scene
 from dexzoo.sim.world import Physics
 
-_INSIDE = 0.002  # metres that the hand may overlap the object before it sets out
-_AWAY = 10.0  # metres up, where the object is in nobody's way
+_INSIDE = 0.002  # meters that the hand may overlap the object before it sets out
+_AWAY = 10.0  # meters up, out of the way
 Ids = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Variation:
-    """What differs from trial to trial of one scene: mass in kg and friction of the object, each (num_grasps,)."""
+    """Properties of the object that differ from trial to trial of one scene.
+
+    Attributes:
+        mass: Masses in kilograms, (grasp,).
+        friction: Friction coefficients, (grasp,).
+    """
 
     mass: NDArray[np.float64]
     friction: NDArray[np.float64]
@@ -35,19 +39,27 @@ class Variation:
 
 
 class Execution:
-    """Grasps under way on copies of one scene; poses are read from the state of the batch."""
+    """Grasps in execution on copies of one scene; poses are read from the state of the batch.
+
+    Args:
+        scene: The scene.
+        grasps: Grasps in its world frame.
+        model: The scene's model with the hand.
+        physics: How finely it is simulated.
+        num_threads: Threads; 0 uses all cores.
+        variation: Mass and friction of each copy; None leaves the scene's object as it is.
+    """
 
     def __init__(
         self,
         scene: Scene,
         grasps: Grasps,
-        hand: Hand,
         model: mujoco.MjModel,
         physics: Physics,
         num_threads: int = 0,
         variation: Variation | None = None,
     ) -> None:
-        self.motion = Motion(grasps, hand)
+        self.motion = Motion(grasps)
         self.everyone = np.arange(len(grasps))
         self.physics = physics
         self.time = 0.0
@@ -55,8 +67,8 @@ class Execution:
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.wrist_at, self.object_at = model.joint("wrist").qposadr[0], model.joint("object").qposadr[0]
         self.object_dof, self.object_body = model.joint("object").dofadr[0], model.body("object").id
-        self.finger_at = [model.joint(name).qposadr[0] for name in hand.joint_names]
-        self.order = [hand.joint_names.index(model.actuator(i).name) for i in range(model.nu)]
+        self.finger_at = [model.joint(name).qposadr[0] for name in grasps.hand.joint_names]
+        self.order = [grasps.hand.joint_names.index(model.actuator(i).name) for i in range(model.nu)]
         self.center, self.radius = scene.object.inertia[0], scene.object.radius
         if variation is not None:
             self._vary(variation, scene)
@@ -78,7 +90,12 @@ class Execution:
         self.batch.set_const()
 
     def advance(self, ids: Ids, until: float) -> None:
-        """Follow the motion up to a time since the start, which must not lie beyond the start of the lift before it."""
+        """Follow the motion up to a time; to pass the start of the lift takes two calls, since time steps differ.
+
+        Args:
+            ids: Grasps, by their place.
+            until: Seconds since the start.
+        """
         physics, carries = self.physics, self.time > LIFT_START - 1e-6
         step = physics.carry_timestep if carries else physics.timestep
         times = self.time + step * np.arange(1, round((until - self.time) / step) + 1, dtype=np.float64)
@@ -95,29 +112,45 @@ class Execution:
         self.time = float(times[-1])
 
     def broken(self, ids: Ids) -> NDArray[np.bool_]:
-        """Whose solver has warned or diverged."""
+        """Whether the solver has warned or diverged, (n,).
+
+        Args:
+            ids: Grasps, by their place.
+        """
         warned = self.batch.warning[ids, :, 1].sum(-1) > 0
         return np.asarray(warned | ~np.isfinite(self.qpos[ids]).all(-1))
 
     def wrist(self, ids: Ids) -> NDArray[np.float64]:
-        """(n, 7) poses of the wrist: position and quaternion."""
+        """Poses of the wrist, position and quaternion, (n, 7).
+
+        Args:
+            ids: Grasps, by their place.
+        """
         return np.asarray(self.qpos[ids, self.wrist_at : self.wrist_at + 7])
 
     def object(self, ids: Ids) -> NDArray[np.float64]:
-        """(n, 7) poses of the object: its centre of mass and its quaternion."""
+        """Poses of the object, its center of mass and its quaternion, (n, 7).
+
+        Args:
+            ids: Grasps, by their place.
+        """
         pose = np.array(self.qpos[ids, self.object_at : self.object_at + 7])
         pose[:, :3] += rotation.rotate(torch.tensor(pose[:, 3:]), torch.tensor(self.center)).numpy()
         return pose
 
     def in_palm(self, ids: Ids) -> NDArray[np.float64]:
-        """(n, 7) poses of the object in the palm frame."""
+        """Poses of the object in the palm frame, (n, 7).
+
+        Args:
+            ids: Grasps, by their place.
+        """
         wrist, pose = torch.tensor(self.wrist(ids)), torch.tensor(self.object(ids))
         inverse = rotation.conjugate(wrist[:, 3:])
         offset = rotation.rotate(inverse, pose[:, :3] - wrist[:, :3])
         return torch.cat((offset, rotation.normalize(rotation.multiply(inverse, pose[:, 3:]))), -1).numpy()
 
     def obstructed(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Whether the commanded path to the grip meets what stands fast, and whether it starts in the object."""
+        """Whether the commanded path to the grip meets the table or a block, and whether it starts in the object."""
         model, data = self.batch.model, mujoco.MjData(self.batch.model)
         collided, inside = np.zeros(len(self.everyone), bool), np.zeros(len(self.everyone), bool)
         wrist, turn, joints = self.motion.closing()
@@ -135,7 +168,11 @@ class Execution:
         return collided, inside
 
     def contact_force(self, ids: Ids) -> NDArray[np.float64]:
-        """(n,) sums of the normal forces between hand and object, in newtons."""
+        """Sums of the normal forces between hand and object in newtons, (n,).
+
+        Args:
+            ids: Grasps, by their place.
+        """
         force, wrench = np.zeros(len(ids)), np.zeros(6)
         data = mujoco.MjData(self.batch.model)
         for i, sim in enumerate(ids):

@@ -10,16 +10,21 @@ from scipy.spatial import cKDTree
 from dexzoo.sim.objects import ObjectModel
 
 Array = NDArray[np.float64]
-_PROBE = 1e-4  # m in front of a part's face: what lies in another part there is no surface of the whole
-_NEIGHBOURS = 8
+_PROBE = 1e-4  # m in front of a part's face: a point in another part is not on the surface of the whole
+_NEIGHBORS = 8
 _REFERENCES = 24_000  # points to measure to: a triangle of a part that none falls on is not measured to
 
 
 def surface_distance(model: ObjectModel, num_points: int = 4000, seed: int = 0) -> float:
     """Two-sided Hausdorff distance (m) between the mesh and the surface of the union of the convex parts.
 
-    From num_points points drawn on each surface, inner walls included, to the nearest triangles of the other one; it
-    can miss a spot that no point falls on.
+    It is measured from points drawn on each surface, inner walls included, to the nearest triangles of the other one,
+    and can miss a spot that no point falls on.
+
+    Args:
+        model: The object.
+        num_points: Points drawn on each surface.
+        seed: Seed of the points.
     """
     seen, seen_triangles = _draw(model.mesh, _REFERENCES, seed)
     area = sum(part.area for part in model.hulls)
@@ -36,7 +41,12 @@ def surface_distance(model: ObjectModel, num_points: int = 4000, seed: int = 0) 
 
 
 def covered(model: ObjectModel, points: Array) -> NDArray[np.bool_]:
-    """Which points (n, 3), in m, lie in a convex part."""
+    """Whether points lie in a convex part, (n,).
+
+    Args:
+        model: The object.
+        points: Points in the object's frame, meters, (n, 3).
+    """
     inside = np.zeros(len(points), bool)
     for part in model.hulls:
         low, high = part.bounds
@@ -62,8 +72,8 @@ def _draw_ahead(part: trimesh.Trimesh, num: int, seed: int) -> tuple[Array, Arra
 
 def _farthest(points: Array, others: Array, triangles: Array, surface: Array) -> float:
     """Largest distance of points (n, 3) from a surface, which others are drawn on; triangles are those they lie on."""
-    _, near = cKDTree(others).query(points, k=_NEIGHBOURS)
-    repeated = np.repeat(points, _NEIGHBOURS, axis=0)
+    _, near = cKDTree(others).query(points, k=_NEIGHBORS)
+    repeated = np.repeat(points, _NEIGHBORS, axis=0)
     # the nearest triangle need not be among those of the nearest points, so these distances bound from above
     bound = _distance(repeated, triangles[near.ravel()]).reshape(near.shape).min(1)
     farthest = 0.0

@@ -18,17 +18,25 @@ MIN_EXTENT, MAX_EXTENT = 5e-4, 1.0
 MIN_SLIVER = 2e-4
 MAX_FRICTION = 2.0
 PATIENCE = 180.0
-"""Seconds that CoACD may take for one mesh; with holes or faces that cut each other it can be busy for ever."""
+"""Seconds that CoACD may take for one mesh; with holes or faces that cut each other it may never end."""
 _DECOMPOSE = Path(__file__).with_name("decompose.py")
 Mesh = trimesh.Trimesh
 
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """A rigid object in its own frame: metres, z up, standing as it should be placed.
+    """A rigid object in its own frame: meters, z up, standing as it should be placed.
 
-    mesh: what the camera sees. hulls: convex parts, what the hand touches. mass in kg; friction is the sliding
-    coefficient that acts between the object and whatever touches it.
+    Attributes:
+        name: Name of the object.
+        mesh: Surface that the camera sees.
+        hulls: Convex parts that the hand touches.
+        mass: Mass in kilograms.
+        friction: Sliding coefficient between the object and whatever touches it.
+        category: Category, if any.
+
+    Raises:
+        ValueError: The mass or the friction cannot be.
     """
 
     name: str
@@ -53,15 +61,25 @@ class ObjectModel:
         hulls: Sequence[str | Path | Mesh] | None = None,
         name: str | None = None,
     ) -> ObjectModel:
-        """An object from a mesh file in metres (any format trimesh reads), or from a mesh.
+        """Make an object of a mesh.
 
-        hulls: its convex parts, as files or meshes; None has them computed by CoACD (Wei et al. 2022), which takes
-        seconds to a minute. Parts thinner than 0.2 mm, as decompositions leave them, are dropped.
-        name: by default that of the file, or of its folder where the file is called mesh.
         Unused vertices, faces that are double or of no area, holes of three or four edges, and faces of a closed mesh
         that look inwards are mended; larger holes and edges of more than two faces are left to CoACD.
-        Raises FileNotFoundError or ValueError for a mesh that is missing, empty, flat, not finite, not in metres or
-        too bad for CoACD.
+
+        Args:
+            mesh: File in meters, of any format that trimesh reads, or a mesh.
+            mass: Mass in kilograms.
+            friction: Sliding coefficient.
+            hulls: Convex parts, as files or meshes; None has them computed by CoACD (Wei et al. 2022), which takes
+                seconds to a minute. Parts thinner than 0.2 mm, as decompositions leave them, are dropped.
+            name: Name of the object; by default that of the file, or of its folder if the file is called mesh.
+
+        Returns:
+            The object.
+
+        Raises:
+            FileNotFoundError: A file does not exist.
+            ValueError: The mesh is empty, flat, not finite, not in meters or too bad for CoACD.
         """
         label = name or ("object" if isinstance(mesh, Mesh) else _name(Path(mesh)))
         surface = _read(mesh, label)
@@ -79,7 +97,7 @@ class ObjectModel:
 
     @property
     def inertia(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centre of mass (3,) in m and inertia (3, 3) in kg m2 about it, of convex parts of one density."""
+        """Center of mass (3,) in m and inertia (3, 3) in kg m2 about it, of convex parts of one density."""
         volumes = np.array([hull.volume for hull in self.hulls])
         masses = self.mass * volumes / volumes.sum()
         centers = np.array([hull.center_mass for hull in self.hulls])
@@ -92,11 +110,15 @@ class ObjectModel:
 
     @property
     def radius(self) -> float:
-        """Largest distance in m of a point of the object from its centre of mass."""
+        """Largest distance in m of a point of the object from its center of mass."""
         return float(np.linalg.norm(self.mesh.vertices - self.inertia[0], axis=1).max())
 
     def scaled(self, factor: float) -> ObjectModel:
-        """The object made larger or smaller; its mass stays."""
+        """The object made larger or smaller; its mass stays.
+
+        Args:
+            factor: Factor of all lengths.
+        """
         return replace(
             self,
             mesh=self.mesh.copy().apply_scale(factor),
@@ -135,11 +157,11 @@ def _check(mesh: Mesh, where: str) -> None:
         raise ValueError(f"mesh {where} has vertices that are not finite")
     extent = mesh.extents
     if extent.max() > MAX_EXTENT:
-        raise ValueError(f"mesh {where} is {extent.max():.1f} m large and looks like millimetres; divide it by 1000")
+        raise ValueError(f"mesh {where} is {extent.max():.1f} m large and looks like millimeters; divide it by 1000")
 
 
 def _mended(mesh: Mesh) -> Mesh:
-    """Without what no surface has, small holes filled, and its faces looking outwards where it is closed."""
+    """Degenerate faces removed, small holes filled, and faces of a closed mesh turned outwards."""
     mesh = mesh.copy()
     mesh.merge_vertices()
     mesh.update_faces(mesh.unique_faces() & mesh.nondegenerate_faces())
@@ -152,7 +174,7 @@ def _mended(mesh: Mesh) -> Mesh:
 
 
 def _convex(parts: Sequence[Mesh]) -> tuple[Mesh, ...]:
-    """Convex hulls of the parts, but for those that are thin as a foil."""
+    """Convex hulls of the parts, without those as thin as a foil."""
     solid = []
     for part in parts:
         try:

@@ -1,4 +1,4 @@
-"""How an object comes to lie in a scene: its orientation, what it lies on, and its drop."""
+"""Placement of an object in a scene: its orientation, its support, and its drop."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from dexzoo.sim.world import WORKING, Support, make_world
 
 TRIES = 3
 MAX_SIZE = 0.5
-"""Largest extent in metres of an object that a scene holds: what a camera 0.4 m away still sees most of."""
+"""Largest extent in meters of an object in a scene; a camera 0.4 m away still sees most of it."""
 FINGER_CLEARANCE = 0.022
-"""What a supported object keeps from the table, in metres: a finger's thickness."""
+"""Clearance of a supported object from the table in meters: a finger's thickness."""
 LONG = ("fork", "knife", "scissors", "spatula", "spoon")
 """Categories of long flat things; they lie on a block of 70 % of their width and up to 40 % of their length."""
 LONG_HEIGHT = 0.055
-"""Metres of that block's height, so high since a spoon or a spatula lies on it with one end down."""
+"""Meters of that block's height, so high since a spoon or a spatula lies on it with one end down."""
 WIDE = ("dustpan", "pan", "plate")
 """Categories whose rim would lie too low for fingers; they lie on a square block of half their smaller extent."""
 WIDE_HEIGHT = 0.04
@@ -32,11 +32,20 @@ _STAYS = 5e-4  # m, or half radians, over the last quarter of the time
 
 
 def place(obj: ObjectModel, seed: int) -> tuple[NDArray[np.float64], Support | None]:
-    """Drop an object and let it settle: its pose T_world_object (4, 4), and the block it lies on, if any.
+    """Drop an object and let it settle.
 
     The yaw is random. Funnels, and cups in half of the scenes, start in any orientation (the simulator behind the
-    thesis). Its lowest point starts 5 mm above the table or the block, its centre of mass over the origin.
-    Raises ValueError when it is too large, or does not come to rest near the origin in three tries.
+    thesis). The lowest point starts 5 mm above the table or the block, the center of mass over the origin.
+
+    Args:
+        obj: The object.
+        seed: Seed of its orientation.
+
+    Returns:
+        Its pose T_world_object (4, 4), and the block that it lies on, if any.
+
+    Raises:
+        ValueError: The object is too large, or does not come to rest near the origin in three tries.
     """
     if obj.mesh.extents.max() > MAX_SIZE:
         raise ValueError(
@@ -61,11 +70,18 @@ def place(obj: ObjectModel, seed: int) -> tuple[NDArray[np.float64], Support | N
 
 
 def support_for(obj: ObjectModel) -> Support | None:
-    """The block that objects of this category lie on, narrower than they are, so that fingers get under them."""
+    """The block that objects of this category lie on, narrower than they are, so that fingers get under them.
+
+    Args:
+        obj: The object.
+
+    Returns:
+        The block; None for an object that lies on the table.
+    """
     extents = obj.mesh.extents[:2]
     if obj.category in LONG:
         axis = int(extents.argmax())
-        # the block stands below the centre of mass, from where one end may be near
+        # the block stands below the center of mass, from where one end may be near
         reach = np.abs(obj.mesh.bounds[:, axis] - obj.inertia[0][axis]).min()
         half = 0.35 * extents
         half[axis] = max(min(0.2 * extents[axis], reach - FINGER_CLEARANCE), 0.01)
@@ -97,7 +113,7 @@ def _settle(obj: ObjectModel, support: Support | None, quaternion: NDArray[np.fl
             still_since = data.time
         if data.time < 0.75 * SETTLE_TIME:
             late = data.qpos.copy()
-    # what rocks on three points trembles for ever, but stays where it is
+    # an object on three points may tremble for ever without moving
     stays = data.time < SETTLE_TIME or np.abs(data.qpos - late).max() < _STAYS
     body = data.body("object")
     pose = np.eye(4)

@@ -1,4 +1,4 @@
-"""What a camera sees of a scene, by casting rays (Embree, by way of trimesh): no graphics card is needed."""
+"""Depth images of a scene by casting rays (Embree, through trimesh); no graphics card is needed."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from dexzoo.camera import Camera
-from dexzoo.segmentation import MAX_DEPTH
+from dexzoo.perception.camera import Camera
+from dexzoo.perception.table import MAX_DEPTH
 from dexzoo.sim.objects import Mesh
 
-_TOUCH = 2e-3  # share of a ray's length within which what it hits is the point it was cast at
+_TOUCH = 2e-3  # share of a ray's length by which a hit may miss the point it was cast at
 
 
 class RayCaster:
-    """Casts rays at an object, and what it lies on, over the table z = 0; all in the world frame."""
+    """Casts rays at an object and its support over the table z = 0; all in the world frame.
+
+    Args:
+        obj: Mesh of the object.
+        support: Mesh of the block that it lies on, if any.
+    """
 
     def __init__(self, obj: Mesh, support: Mesh | None) -> None:
         joined = obj if support is None else trimesh.util.concatenate([obj, support])
@@ -27,7 +32,15 @@ class RayCaster:
         self._offsets = (self._normals * self._mesh.triangles[:, 0]).sum(1)
 
     def depth(self, camera: Camera, pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Exact depth (height, width) in m, 0 beyond 1.4 m, and the pixels that see the object."""
+        """Exact depth image.
+
+        Args:
+            camera: The camera.
+            pose: T_world_camera, (4, 4).
+
+        Returns:
+            Depth in meters, 0 beyond 1.4 m, and the pixels that see the object, both (height, width).
+        """
         rays = camera.directions()
         with np.errstate(divide="ignore"):
             depth = -pose[2, 3] / (rays @ pose[2, :3])  # of the table
@@ -44,7 +57,14 @@ class RayCaster:
     def lit(
         self, depth: NDArray[np.float64], camera: Camera, pose: NDArray[np.float64], projector: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Which pixels (height, width) show a point that a projector at `projector` (3,) reaches."""
+        """Pixels that show a point which a projector reaches, (height, width).
+
+        Args:
+            depth: Exact depth in meters, (height, width).
+            camera: The camera.
+            pose: T_world_camera, (4, 4).
+            projector: Place of the projector in the world frame, (3,).
+        """
         vertices = np.asarray(self._mesh.vertices)
         # shadows fall on the object, its support and the table: no farther than those of the vertices
         drop = np.maximum(projector[2] - vertices[:, 2], 0.01)

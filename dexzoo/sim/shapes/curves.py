@@ -1,4 +1,4 @@
-"""Plane curves that shapes are made of: profiles with rounded corners, and closed sections. Lengths in millimetres."""
+"""Plane curves that shapes are made of: profiles with rounded corners, and closed sections. Lengths in millimeters."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ _STEP = 0.2  # rad that a rounded corner turns from point to point
 
 
 def rounded(corners: Sequence[tuple[Number, ...]], spacing: Number | None = None) -> Array:
-    """A polyline (point, 2) through corners (x, y) or (x, y, cut), with a parabola in place of each cut corner.
+    """A polyline (point, 2) through corners, with a parabola instead of each cut corner.
 
-    cut: how far before and behind the corner the parabola begins and ends, at most half of a side.
-    spacing: straight lines are divided into pieces no longer than this.
+    Args:
+        corners: Corners (x, y) or (x, y, cut); the parabola begins and ends `cut` before and behind the corner,
+            at most half of a side.
+        spacing: Straight lines are divided into pieces no longer than this.
     """
     at = np.array([corner[:2] for corner in corners], float)
     cuts = [corner[2] if len(corner) > 2 else 0.0 for corner in corners]
@@ -38,7 +40,12 @@ def rounded(corners: Sequence[tuple[Number, ...]], spacing: Number | None = None
 
 
 def divided(points: Array, spacing: Number | None) -> Array:
-    """The polyline (point, n) with points put in, so that none are further apart than `spacing`."""
+    """A polyline with points put in, so that none are further apart than `spacing`.
+
+    Args:
+        points: The polyline, (point, n).
+        spacing: Largest distance; None leaves it as it is.
+    """
     if spacing is None:
         return points
     pieces = [
@@ -49,21 +56,37 @@ def divided(points: Array, spacing: Number | None) -> Array:
 
 
 def normals(points: Array) -> Array:
-    """Unit normals (point, 2) of a polyline, to the right of its direction."""
+    """Unit normals (point, 2) of a polyline, to the right of its direction.
+
+    Args:
+        points: The polyline, (point, 2).
+    """
     tangent = np.gradient(points, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     return np.column_stack((tangent[:, 1], -tangent[:, 0]))
 
 
 def ellipse(exponent: Number = 2, count: int = 48) -> Array:
-    """A closed superellipse (count, 2) between -1 and 1: 2 is a circle, more goes towards a square."""
+    """A closed superellipse (count, 2) between -1 and 1.
+
+    Args:
+        exponent: 2 is a circle, more goes towards a square.
+        count: Number of points.
+    """
     angle = 2 * np.pi * np.arange(count) / count
     circle = np.column_stack((np.cos(angle), np.sin(angle)))
     return np.asarray(np.sign(circle) * np.abs(circle) ** (2 / exponent), np.float64)
 
 
 def rectangle(half_x: Number, half_y: Number, corner: Number, count: int = 48) -> Array:
-    """A closed rectangle (count, 2) with round corners of the radius `corner`."""
+    """A closed rectangle (count, 2) with round corners.
+
+    Args:
+        half_x: Half width along x.
+        half_y: Half width along y.
+        corner: Radius of the corners.
+        count: Number of points.
+    """
     angle = 2 * np.pi * (np.arange(count) + 0.5) / count
     circle = np.column_stack((np.cos(angle), np.sin(angle)))
     return np.asarray(corner * circle + np.sign(circle) * (np.array([half_x, half_y]) - corner), np.float64)

@@ -1,4 +1,4 @@
-"""Long flat things, lying along x: forks, spoons, knives, spatulas, scissors, a dustpan. Lengths in millimetres."""
+"""Long flat things, lying along x: forks, spoons, knives, spatulas, scissors, a dustpan. Lengths in millimeters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from dexzoo.sim.shapes.solid import Solid, loft, swept, turned, union
 
 
 def fork(rng: np.random.Generator, style: int) -> Solid:
-    """Dinner forks of three and four tines, dessert and serving forks, and carving forks of two."""
+    """Dinner forks of three and four tines, dessert and serving forks, and carving forks of two.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     tines, width, reach = ((4, 12.5, 46.0), (3, 11.5, 42.0), (4, 15.0, 52.0), (2, 9.0, 58.0))[style % 4]
     width, reach, thick = width * u(0.94, 1.06), reach * u(0.92, 1.08), u(1.1, 1.4)
@@ -35,7 +40,12 @@ def fork(rng: np.random.Generator, style: int) -> Solid:
 
 
 def spoon(rng: np.random.Generator, style: int) -> Solid:
-    """Table, soup, tea and serving spoons, and wooden ones."""
+    """Table, soup, tea and serving spoons, and wooden ones.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("table", "soup", "serving", "tea", "wooden")[style % 5]
     long, wide, depth = {
@@ -62,7 +72,12 @@ def spoon(rng: np.random.Generator, style: int) -> Solid:
 
 
 def knife(rng: np.random.Generator, style: int) -> Solid:
-    """Chef's, table, bread, paring, butcher's and butter knives."""
+    """Chef's, table, bread, paring, butcher's and butter knives.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("chef", "table", "bread", "paring", "cleaver", "butter")[style % 6]
     if kind in ("table", "butter"):
@@ -93,7 +108,12 @@ def knife(rng: np.random.Generator, style: int) -> Solid:
 
 
 def spatula(rng: np.random.Generator, style: int) -> Solid:
-    """Turners with a bent neck, dough scrapers of rubber, and wooden and fish turners."""
+    """Turners with a bent neck, dough scrapers of rubber, and wooden and fish turners.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("turner", "rubber", "wooden", "fish")[style % 4]
     if kind == "rubber":
@@ -122,7 +142,12 @@ def spatula(rng: np.random.Generator, style: int) -> Solid:
 
 
 def scissors(rng: np.random.Generator, style: int) -> Solid:
-    """Paper, sewing, children's and kitchen scissors, from closed to a third open."""
+    """Paper, sewing, children's and kitchen scissors, from closed to a third open.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     blade, rings = ((90.0, 1.0), (75.0, 0.95), (55.0, 0.9), (85.0, 1.15))[style % 4]
     blade, open_angle = blade * u(0.92, 1.08), (3.0, 12.0, 20.0)[style % 3] * u(0.8, 1.2)
@@ -149,7 +174,12 @@ def scissors(rng: np.random.Generator, style: int) -> Solid:
 
 
 def dustpan(rng: np.random.Generator, style: int) -> Solid:
-    """A hand dustpan: a tray open in front, with a low back wall and a handle behind."""
+    """A hand dustpan: a tray open in front, with a low back wall and a handle behind.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     x, y, wall, h = u(78, 84), u(82, 90), 3.0, u(38, 44)
     floor = hull_prism([(-x, 0), (-x, wall), (x - 20, wall), (x, 0.6), (x, 0)], -y, y)
@@ -164,7 +194,13 @@ def dustpan(rng: np.random.Generator, style: int) -> Solid:
 
 
 def hull_prism(outline: list[tuple[Number, Number]], start: Number, end: Number) -> Solid:
-    """A prism along y over a convex outline of (x, z)."""
+    """A prism along y over a convex outline.
+
+    Args:
+        outline: Corners (x, z).
+        start: Least y.
+        end: Largest y.
+    """
     loop = np.array(outline)
     return loft(np.stack([np.insert(loop, 1, y, axis=1) for y in (start, end)]))
 

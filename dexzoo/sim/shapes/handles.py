@@ -1,4 +1,4 @@
-"""What is put onto a body: handles, spouts, stems, knobs. Lengths in millimetres; handles point along +x."""
+"""Attachments of a body: handles, spouts, stems, knobs. Lengths in millimeters; handles point along +x."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from dexzoo.sim.shapes.solid import Solid, loft, swept, turned
 
 
 def radius_at(profile: Array, height: Number) -> float:
-    """The radius of a profile (row, 2) of radii and rising heights at one height."""
+    """The radius of a profile at one height.
+
+    Args:
+        profile: Radii and rising heights, (row, 2).
+        height: The height.
+    """
     return float(np.interp(height, profile[:, 1], profile[:, 0]))
 
 
@@ -22,10 +27,16 @@ def ear(
     bend: Number = 40.0,
     taper: Number = 1.0,
 ) -> Solid:
-    """A loop handle between two points (radius, height) of a wall, for one to three fingers.
+    """A loop handle between two points of a wall, for one to three fingers.
 
-    reach: how far it stands out. width, thickness: half of each. bend: how far from its corners it starts to turn;
-    small ones make a D, large ones a C. taper: reach at the lower end over that at the upper.
+    Args:
+        high: Upper point (radius, height).
+        low: Lower point.
+        reach: How far it stands out.
+        width: Half width.
+        thickness: Half thickness.
+        bend: How far from its corners it starts to turn; small ones make a D, large ones a C.
+        taper: Reach at the lower end over that at the upper.
     """
     path = rounded(
         [high, (high[0] + reach, high[1] + 0.08 * reach, bend), (low[0] + taper * reach, low[1], bend), low], 5.0
@@ -34,7 +45,14 @@ def ear(
 
 
 def grip(path: list[tuple[Number, ...]], width: list[Number], thickness: list[Number], exponent: Number = 2.8) -> Solid:
-    """A straight or curved handle along corners (x, z, cut) of a path; half widths and thicknesses along it."""
+    """A straight or curved handle along a path.
+
+    Args:
+        path: Corners (x, z, cut).
+        width: Half widths along it.
+        thickness: Half thicknesses along it.
+        exponent: Exponent of its section.
+    """
     points = rounded(path, 8.0)
     length = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     share = length / length[-1]
@@ -46,7 +64,15 @@ def grip(path: list[tuple[Number, ...]], width: list[Number], thickness: list[Nu
 
 
 def spout(start: tuple[Number, Number], tip: tuple[Number, Number], root: Number, mouth: Number, swan: Number) -> Solid:
-    """A tapered spout along -x from a point (radius, height) in the body to its tip; swan: how much it is curved."""
+    """A tapered spout along -x from a point in the body to its tip.
+
+    Args:
+        start: Point (radius, height) in the body.
+        tip: The tip.
+        root: Radius at the body.
+        mouth: Radius at the tip.
+        swan: How much it is curved.
+    """
     middle = ((start[0] + tip[0]) / 2 + swan, (start[1] + tip[1]) / 2 - swan, 60.0)
     path = rounded([start, middle, tip], 4.0)
     size = np.linspace(root, mouth, len(path))
@@ -55,7 +81,13 @@ def spout(start: tuple[Number, Number], tip: tuple[Number, Number], root: Number
 
 
 def knob(radius: Number, bottom: Number, neck: Number = 0.55) -> Solid:
-    """A round knob with a waist, standing on a lid."""
+    """A round knob with a waist, standing on a lid.
+
+    Args:
+        radius: Its radius.
+        bottom: Height of the lid.
+        neck: Radius of the waist over that of the knob.
+    """
     r = radius
     profile = [(0.8 * r, bottom - 2), (0.8 * r, bottom, 1), (neck * r, bottom + 0.4 * r, 2), (r, bottom + 0.9 * r, 3)]
     return loft(turned(rounded([*profile, (0.9 * r, bottom + 1.7 * r, 4), (0.15 * r, bottom + 1.8 * r)])))

@@ -1,4 +1,4 @@
-"""Thin walls: open vessels of revolution, and curved sheets such as the bowl of a spoon. Lengths in millimetres.
+"""Thin walls: open vessels of revolution, and curved sheets such as the bowl of a spoon. Lengths in millimeters.
 
 A wall is cut into flat-backed convex blocks. A block's inner face is a chord, which would stand into the cavity by its
 sagitta; moved outwards by half of that, it is wrong by as much on both sides.
@@ -28,9 +28,13 @@ _RIM = np.sqrt(1 - np.array([0.5, 0.85, 0.985]) ** 2)
 
 @dataclass(frozen=True)
 class Wall:
-    """A wall of revolution: profiles (row, 2) of radii and heights, outside and inside, row by row across from it.
+    """A wall of revolution.
 
-    lip: how far it is drawn out along -x at its rim; lip_width: the angle on each side of -x over which it is.
+    Attributes:
+        outer: Profile outside: radii and heights, (row, 2).
+        inner: Profile inside, row by row across from it.
+        lip: How far it is drawn out along -x at its rim.
+        lip_width: Angle on each side of -x over which it is.
     """
 
     outer: Array
@@ -40,7 +44,13 @@ class Wall:
 
     @classmethod
     def along(cls, profile: Array, thickness: Number, lip: Number = 0) -> Wall:
-        """The wall whose outer side is the profile, its rim rounded."""
+        """The wall whose outer side is the profile, its rim rounded.
+
+        Args:
+            profile: Profile of the outer side, (row, 2).
+            thickness: Thickness of the wall.
+            lip: How far the rim is drawn out along -x.
+        """
         aside = normals(profile)
         inner = profile - thickness * aside
         along = np.array([-aside[-1, 1], aside[-1, 0]]) * thickness / 2
@@ -50,7 +60,11 @@ class Wall:
         return cls(np.concatenate((profile, middle + half + rise)), np.concatenate((inner, middle - half + rise)), lip)
 
     def cut(self, height: Number) -> tuple[Wall, int]:
-        """The wall with a row whose inner side is at that height, above which it does not come back; and the row."""
+        """The wall with a row whose inner side is at that height, above which it does not come back; and the row.
+
+        Args:
+            height: The height.
+        """
         row = int(np.flatnonzero(self.inner[:, 1] < height)[-1])
         share = (height - self.inner[row, 1]) / (self.inner[row + 1, 1] - self.inner[row, 1])
         outer, inner = (
@@ -60,7 +74,12 @@ class Wall:
         return replace(self, outer=outer, inner=inner), row + 1
 
     def sides(self, angles: Array, rows: slice = slice(None)) -> tuple[Array, Array]:
-        """Points (row, angle, 3) outside and inside."""
+        """Points (row, angle, 3) outside and inside.
+
+        Args:
+            angles: Angles about z, radians.
+            rows: Rows of the profiles.
+        """
         directions = np.column_stack((np.cos(angles), np.sin(angles)))
 
         def surface(profile: Array) -> Array:
@@ -86,8 +105,12 @@ class Wall:
 def vessel(profile: Array, thickness: Number, budget: int, floor: Number | None = None, lip: Number = 0) -> Solid:
     """An open vessel of revolution around z.
 
-    profile: radii and heights (row, 2) of its outer side, upwards. floor: thickness of its bottom, by default that of
-    the wall. budget: number of parts at most. lip: how far the rim is drawn out along -x, for pouring.
+    Args:
+        profile: Radii and heights (row, 2) of its outer side, upwards.
+        thickness: Thickness of the wall.
+        budget: Most parts.
+        floor: Thickness of its bottom; by default that of the wall.
+        lip: How far the rim is drawn out along -x, for pouring.
     """
     wall = Wall.along(divided(profile, _SPACING), thickness, lip)
     level = wall.outer[0, 1] + (thickness if floor is None else floor)
@@ -103,14 +126,26 @@ def vessel(profile: Array, thickness: Number, budget: int, floor: Number | None 
 
 
 def pipe(profile: Array, thickness: Number, budget: int) -> Solid:
-    """A wall of revolution that is open at both ends."""
+    """A wall of revolution that is open at both ends.
+
+    Args:
+        profile: Radii and heights (row, 2) of its outer side, upwards.
+        thickness: Thickness of the wall.
+        budget: Most parts.
+    """
     wall = Wall.along(divided(profile, _SPACING), thickness)
     outer, inner = wall.sides(2 * np.pi * np.arange(_COLUMNS) / _COLUMNS)
     return Solid(skin(np.concatenate((outer, inner[::-1])), closed=True), _sectors(wall, *_layout(wall, 0, budget)))
 
 
 def sheet(upper: Array, lower: Array, pieces: tuple[int, int]) -> Solid:
-    """A sheet between two grids of points (row, column, 3); pieces: number of convex parts along rows and columns."""
+    """A sheet between two grids of points (row, column, 3).
+
+    Args:
+        upper: Upper grid.
+        lower: Lower grid.
+        pieces: Number of convex parts along rows and columns.
+    """
     mesh = skin(np.concatenate((lower, upper[:, ::-1]), 1))
     cuts = [np.linspace(0, n - 1, k + 1).round().astype(int) for n, k in zip(lower.shape, pieces, strict=False)]
     parts = [
@@ -142,7 +177,7 @@ def _sagitta(outer: Array, inner: Array, across: Array) -> tuple[float, float]:
 def _sectors(wall: Wall, cuts: tuple[int, ...], counts: tuple[int, ...]) -> list[Mesh]:
     """The wall cut into blocks: bands between rows, so many sectors around each, two of which meet at a lip's tip.
 
-    What belongs to the lip is cut at its base, too.
+    The lip is cut at its base, too.
     """
     base = int(np.searchsorted(wall.outer[:, 1], wall.lip_base))
     parts = []

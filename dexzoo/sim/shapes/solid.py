@@ -1,4 +1,4 @@
-"""Solids: a watertight mesh and the convex parts that fit it, made from the same sections. Lengths in millimetres.
+"""Solids: a watertight mesh and the convex parts that fit it, made from the same sections. Lengths in millimeters.
 
 `loft` skins a row of sections; bodies of revolution, tubes, bars and blades are lofts. `union` joins solids.
 """
@@ -24,34 +24,55 @@ _FLAT = 0.05
 
 @dataclass(frozen=True)
 class Solid:
-    """mesh: its surface, watertight. parts: convex, together as large as the mesh within 2 mm."""
+    """A watertight mesh and its convex parts.
+
+    Attributes:
+        mesh: Its surface, watertight.
+        parts: Convex parts, together as large as the mesh within 2 mm.
+    """
 
     mesh: Mesh
     parts: list[Mesh]
 
     def moved(self, offset: Sequence[Number] = (0, 0, 0), degrees: Number = 0.0, axis: str = "z") -> Solid:
-        """The solid turned about an axis through the origin, then shifted."""
+        """The solid turned about an axis through the origin, then shifted.
+
+        Args:
+            offset: The shift.
+            degrees: The angle.
+            axis: x, y or z.
+        """
         turn = trimesh.transformations.rotation_matrix(np.deg2rad(degrees), np.eye(3)["xyz".index(axis)])
         turn[:3, 3] = offset
         return Solid(self.mesh.copy().apply_transform(turn), [part.copy().apply_transform(turn) for part in self.parts])
 
 
 def union(*solids: Solid) -> Solid:
-    """Several solids as one; where they overlap, the mesh has no inner walls."""
+    """Several solids as one; where they overlap, the mesh has no inner walls.
+
+    Args:
+        solids: The solids.
+    """
     mesh = trimesh.boolean.union([solid.mesh for solid in solids], engine="manifold")
     return Solid(mesh, [part for solid in solids for part in solid.parts])
 
 
 def hull(points: Array) -> Mesh:
-    """The convex hull of points (..., 3), rounded to a nanometre: noise in what is flat can leave a facet out."""
+    """The convex hull of points (..., 3), rounded to a nanometer: noise in what is flat can leave a facet out.
+
+    Args:
+        points: The points.
+    """
     mesh: Mesh = trimesh.convex.convex_hull(points.reshape(-1, 3).round(6))
     return mesh
 
 
 def skin(sections: Array, closed: bool = False) -> Mesh:
-    """A watertight mesh over sections (section, point, 3), closed loops each; outside is out.
+    """A watertight mesh over sections; outside is out.
 
-    closed: the last section is joined to the first one; otherwise both are capped from their middle.
+    Args:
+        sections: Closed loops, (section, point, 3).
+        closed: Whether the last section is joined to the first one; otherwise both are capped from their middle.
     """
     levels, count = sections.shape[:2]
     vertices = sections.reshape(-1, 3)
@@ -74,15 +95,26 @@ def skin(sections: Array, closed: bool = False) -> Mesh:
 
 
 def loft(sections: Array, closed: bool = False, tolerance: Number = TOLERANCE) -> Solid:
-    """A solid over sections (section, point, 3), each a convex loop.
+    """A solid over sections.
 
     Its parts are hulls of as many sections in a row as the tolerance allows.
+
+    Args:
+        sections: Convex loops, (section, point, 3).
+        closed: Whether the last section is joined to the first one.
+        tolerance: How far a part may stand out.
     """
     return Solid(skin(sections, closed), convex_parts(sections, closed, tolerance))
 
 
 def convex_parts(sections: Array, closed: bool = False, tolerance: Number = TOLERANCE) -> list[Mesh]:
-    """Hulls of as many sections in a row as stand out beyond their surface by no more than the tolerance."""
+    """Hulls of as many sections in a row as stand out beyond their surface by no more than the tolerance.
+
+    Args:
+        sections: Convex loops, (section, point, 3).
+        closed: Whether the last section is joined to the first one.
+        tolerance: How far a part may stand out.
+    """
     normals = skin(sections, closed).vertex_normals[: sections.shape[0] * sections.shape[1]].reshape(sections.shape)
     if closed:
         sections, normals = (np.concatenate((each, each[:1])) for each in (sections, normals))
@@ -119,7 +151,13 @@ def _is_flat(sections: Array) -> bool:
 
 
 def exit_distance(cloud: Array, points: Array, directions: Array) -> Array:
-    """How far each point (n, 3) in the hull of a cloud is from leaving it along its direction (n, 3)."""
+    """Distance of points in the hull of a cloud from leaving it along a direction.
+
+    Args:
+        cloud: The cloud.
+        points: Points in its hull, (n, 3).
+        directions: Directions, (n, 3).
+    """
     planes = ConvexHull(cloud).equations
     height = np.maximum(-(points @ planes[:, :3].T + planes[:, 3]), 0)
     speed = directions @ planes[:, :3].T
@@ -128,9 +166,12 @@ def exit_distance(cloud: Array, points: Array, directions: Array) -> Array:
 
 
 def turned(profile: Array, section: Array | None = None, exponent: Array | None = None) -> Array:
-    """Sections (level, point, 3) of a body of revolution with the profile (level, 2) of radii and heights.
+    """Sections (level, point, 3) of a body of revolution.
 
-    section: another loop than the circle, of the size one. exponent: superellipses instead, one for each level.
+    Args:
+        profile: Radii and heights, (level, 2).
+        section: Another loop than the circle, of the size one.
+        exponent: Exponents of superellipses instead, one for each level.
     """
     if exponent is not None:
         loops = np.stack([ellipse(each) for each in exponent])
@@ -143,7 +184,15 @@ def turned(profile: Array, section: Array | None = None, exponent: Array | None 
 def swept(
     path: Array, width: Array | Number, thickness: Array | Number, exponent: Number = 2.5, count: int = 20
 ) -> Array:
-    """Sections of a bar along a path (point, 2) in the xz plane: half widths along y, half thicknesses across."""
+    """Sections of a bar along a path in the xz plane.
+
+    Args:
+        path: The path, (point, 2).
+        width: Half widths along y.
+        thickness: Half thicknesses across.
+        exponent: Exponent of the section.
+        count: Points of a section.
+    """
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     loop = ellipse(exponent, count)

@@ -1,4 +1,4 @@
-"""Open vessels: bowls, cups, mugs, teacups, jugs, plates, pans and funnels. Lengths in millimetres."""
+"""Open vessels: bowls, cups, mugs, teacups, jugs, plates, pans and funnels. Lengths in millimeters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from dexzoo.sim.shapes.solid import Solid, loft, turned, union
 
 
 def bowl(rng: np.random.Generator, style: int) -> Solid:
-    """Cereal, noodle, mixing and deep bowls, and straight ramekins."""
+    """Cereal, noodle, mixing and deep bowls, and straight ramekins.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("cereal", "noodle", "mixing", "deep", "ramekin")[style % 5]
     if kind == "cereal":
@@ -35,7 +40,12 @@ def bowl(rng: np.random.Generator, style: int) -> Solid:
 
 
 def cup(rng: np.random.Generator, style: int) -> Solid:
-    """Cups without a handle: tumblers, paper cups, beakers with a rim, shot glasses, goblets and wine glasses."""
+    """Cups without a handle: tumblers, paper cups, beakers with a rim, shot glasses, goblets and wine glasses.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("tumbler", "paper", "beaker", "wine", "goblet", "barrel")[style % 6]
     if kind == "tumbler":
@@ -61,7 +71,12 @@ def cup(rng: np.random.Generator, style: int) -> Solid:
 
 
 def mug(rng: np.random.Generator, style: int) -> Solid:
-    """Straight, barrel, tapered, flared and camping mugs with one handle."""
+    """Straight, barrel, tapered, flared and camping mugs with one handle.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("straight", "tapered", "barrel", "camping", "waisted")[style % 5]
     r, h, wall = u(36, 42), u(82, 108), u(3, 4.5)
@@ -80,7 +95,12 @@ def mug(rng: np.random.Generator, style: int) -> Solid:
 
 
 def teacup(rng: np.random.Generator, style: int) -> Solid:
-    """Low wide cups with a small handle: hemispherical, flared, conical and upright."""
+    """Low wide cups with a small handle: hemispherical, flared, conical and upright.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("round", "flared", "cone", "upright")[style % 4]
     r, h, wall = u(39, 45), u(50, 62), u(2.6, 3.2)
@@ -98,7 +118,12 @@ def teacup(rng: np.random.Generator, style: int) -> Solid:
 
 
 def jug(rng: np.random.Generator, style: int) -> Solid:
-    """Measuring jugs, pitchers, creamers and water jugs, with a lip and a handle."""
+    """Measuring jugs, pitchers, creamers and water jugs, with a lip and a handle.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("measuring", "pitcher", "creamer", "water")[style % 4]
     r, h = {
@@ -119,7 +144,12 @@ def jug(rng: np.random.Generator, style: int) -> Solid:
 
 
 def plate(rng: np.random.Generator, style: int) -> Solid:
-    """Dinner and side plates, soup plates, and flat ones with an upright edge."""
+    """Dinner and side plates, soup plates, and flat ones with an upright edge.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("dinner", "soup", "flat")[style % 3]
     r = u(75, 105)
@@ -133,7 +163,12 @@ def plate(rng: np.random.Generator, style: int) -> Solid:
 
 
 def pan(rng: np.random.Generator, style: int) -> Solid:
-    """Frying, crepe, saute and sauce pans with a long handle."""
+    """Frying, crepe, saute and sauce pans with a long handle.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     kind = ("frying", "sauce", "crepe", "saute")[style % 4]
     r = {"frying": u(78, 98), "sauce": u(58, 72), "crepe": u(80, 100), "saute": u(76, 92)}[kind]
@@ -154,7 +189,12 @@ def pan(rng: np.random.Generator, style: int) -> Solid:
 
 
 def funnel(rng: np.random.Generator, style: int) -> Solid:
-    """Funnels standing on their mouth: wide and slim ones, some with a straight collar."""
+    """Funnels standing on their mouth: wide and slim ones, some with a straight collar.
+
+    Args:
+        rng: Draws the dimensions.
+        style: Number of the object, which chooses the style.
+    """
     u = rng.uniform
     r, h, stem = u(38, 55), u(40, 60), u(30, 60)
     neck = u(6.5, 10)

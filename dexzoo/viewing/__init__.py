@@ -1,0 +1,1 @@
+"""Pictures of grasps and hands, and pages in the browser."""
