@@ -8,6 +8,7 @@ segmentation.py  the object's pixels
 surface.py       normals and curvatures
 hidden_side.py   a guess of the object's hidden side
 surroundings.py  other things on the table, and the object's support
+memo.py          results that are computed once
 view.py          all of it for one observation, each computed once
 """
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dexzoo.perception.camera import Camera
+from dexzoo.perception.memo import Memo
 from dexzoo.perception.observation import Observation
 from dexzoo.perception.surface import SurfaceFeatures
 from dexzoo.perception.surroundings import beyond, obstacles, underneath
@@ -23,10 +22,9 @@ SHADOW_DEPTHS = (0.007, 0.014)
 """Meters behind the observed surface, along the line of sight, at which the object is taken to go on."""
 SUPPORT_SHARE = 0.35
 """Share of the object's sides under which it is taken to be carried, besides where its support is seen."""
-Result = TypeVar("Result")
 
 
-class View:
+class View(Memo):
     """One observation, prepared for generators, evaluators and refinement.
 
     Whatever is asked of a view is computed at the first call and kept, so hand the same view to `generate`, `score` and
@@ -37,8 +35,8 @@ class View:
     """
 
     def __init__(self, observation: Observation) -> None:
+        super().__init__()
         self.observation = observation
-        self._kept: dict[Hashable, object] = {}
 
     @classmethod
     def of(cls, given: NDArray[np.floating] | Observation | View, camera: Camera | None = None) -> View:
@@ -61,21 +59,6 @@ class View:
         if camera is None:
             raise ValueError("a depth array needs its camera: give camera=")
         return cls(Observation(given, camera))
-
-    def once(self, key: Hashable, make: Callable[[], Result]) -> Result:
-        """The result of `make`, computed at the first call with this key.
-
-        Args:
-            key: Name of the result, with all that it depends on besides the observation.
-            make: Computes it.
-
-        Returns:
-            The result; not to be changed in place.
-        """
-        if key not in self._kept:
-            self._kept[key] = make()
-        found: Result = self._kept[key]  # type: ignore[assignment]  # one key names results of one type
-        return found
 
     @cached_property
     def aimed(self) -> Observation:

@@ -5,9 +5,8 @@ Everything is looked at in the palm's frame: it is quicker to bring points and p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
-from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -15,17 +14,17 @@ from torch import Tensor
 
 from dexzoo.grasp import GRIP, PREGRASP, Trajectory
 from dexzoo.hand import Hand
+from dexzoo.perception.memo import Memo
 from dexzoo.rotation import in_frame
 
 MOMENTS = (PREGRASP, GRIP // 2, GRIP)
 """The waypoints at which the hand is looked at; beyond the grip it is meant to press."""
 NUM_NEAR = 128
 """Points of a kind that are looked at around each hand: enough for the trust region."""
-Result = TypeVar("Result")
 
 
-class PosedHand:
-    """Hands of some grasps at some waypoints; poses are computed when they are first asked for.
+class PosedHand(Memo):
+    """Hands of some grasps at some waypoints; poses are computed on demand, and terms share results by `once`.
 
     Args:
         hand: The hand.
@@ -34,20 +33,8 @@ class PosedHand:
     """
 
     def __init__(self, hand: Hand, grasps: Trajectory, waypoints: Sequence[int] = MOMENTS) -> None:
+        super().__init__()
         self.hand, self.grasps, self.waypoints = hand, grasps, list(waypoints)
-        self._kept: dict[Hashable, object] = {}
-
-    def once(self, key: Hashable, make: Callable[[], Result]) -> Result:
-        """The result of `make`, computed at the first call with this key, so that terms can share it.
-
-        Args:
-            key: Name of the result.
-            make: Computes it.
-        """
-        if key not in self._kept:
-            self._kept[key] = make()
-        found: Result = self._kept[key]  # type: ignore[assignment]  # one key names results of one type
-        return found
 
     @cached_property
     def _way(self) -> Trajectory:
