@@ -21,6 +21,8 @@ def main() -> None:
     views.write_text(with_figures(views.read_text(), sensor()))
     sheet = ROOT / "docs" / "objects.md"
     sheet.write_text(with_figures(sheet.read_text(), objects()))
+    shapes = ROOT / "docs" / "families.md"
+    shapes.write_text(with_figures(shapes.read_text(), families()))
     grasps = ROOT / "docs" / "generator.md"
     grasps.write_text(with_figures(grasps.read_text(), generator()))
     refined = ROOT / "docs" / "refinement.md"
@@ -177,6 +179,31 @@ def objects() -> str:
         f"surface of the parts is within {found['worst_surface_distance_mm']:.2f} mm of the mesh everywhere (two-sided "
         f"Hausdorff distance). All objects take {found['seconds_to_make_all']:.0f} s to make.\n\n"
     ) + table(("category", *head), rows)
+
+
+def families() -> str:
+    found = read("families")
+    rows = [
+        (
+            f"[{name}](families/{name}.png)",
+            row["seconds_each"],
+            between(row["parts"][::2]),
+            between([round(length) for length in row["longest_side_mm"][::2]]),
+            row["worst_surface_distance_mm"],
+            percent(row["rests"]),
+            percent(row["can_be_spanned"]),
+        )
+        for name, row in found["families"].items()
+    ]
+    head = (
+        "s per object",
+        "convex parts",
+        "longest side, mm",
+        "distance, mm",
+        "come to rest",
+        "fit between the fingers",
+    )
+    return f"`benchmarks/families.py`, {found['seeds']} objects of each family.\n\n" + table(("family", *head), rows)
 
 
 def between(values: list[int]) -> str:

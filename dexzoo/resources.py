@@ -1,7 +1,8 @@
-"""Folders of the files that come with the package: robots, configs, checkpoints."""
+"""Folders of the files that come with the package, and of those that it keeps for a user."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parent
@@ -19,3 +20,8 @@ def resource(name: str) -> Path:
     beside = _PACKAGE.parent / name
     asset = _PACKAGE.parent / "assets" / name
     return asset if asset.exists() and not beside.exists() else beside
+
+
+def user_cache() -> Path:
+    """Folder of files that can be made again: $XDG_CACHE_HOME/dexzoo, or ~/.cache/dexzoo."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dexzoo"

@@ -16,11 +16,12 @@ import synthetic
 import torch
 
 from dexzoo.collection import rendering
-from dexzoo.data import grasp_set, writer
+from dexzoo.data import writer
 from dexzoo.data.grasp_set import GraspSet, ViewImages
 from dexzoo.data.schema import SCHEMAS
 from dexzoo.data.writer import GraspSetWriter, SceneRows, scene_rows
 from dexzoo.hand import Hand
+from dexzoo.resources import user_cache
 
 CONFIGURATION = {"seed": 0}
 NUM_VIEWS, NUM_GRASPS = 2, 6
@@ -475,7 +476,7 @@ def test_rendered_views_are_cached_and_made_again_when_damaged(tmp_path: Path, m
 
 def test_the_cache_is_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert grasp_set.user_cache() == tmp_path / "dexzoo"
+    assert user_cache() == tmp_path / "dexzoo"
 
 
 def test_every_table_has_its_version() -> None:

@@ -19,12 +19,12 @@ from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader
 
 from dexzoo.data.batches import BalancedBatches, GraspDataset, ResumableLoader
-from dexzoo.data.grasp_set import GraspSet, Renderer, ViewImages, user_cache
+from dexzoo.data.grasp_set import GraspSet, Renderer, ViewImages
 from dexzoo.data.schema import SOURCES, SPLITS, VERSION
 from dexzoo.grasp import Trajectory
 from dexzoo.models.batch import Batch, Encoding
 from dexzoo.models.evaluator import GraspEvaluator
-from dexzoo.resources import resource
+from dexzoo.resources import resource, user_cache
 
 VIEWS_PER_FILE = 64
 """Views that are encoded and cached together; a grown set keeps the files of its old views."""

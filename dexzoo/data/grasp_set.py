@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +35,7 @@ from dexzoo.grasp import Grasps
 from dexzoo.hand import Hand, HandSpec
 from dexzoo.perception.camera import Camera
 from dexzoo.perception.observation import Observation
+from dexzoo.resources import user_cache
 
 Renderer = Callable[[dict[str, Any], list[int], Path], list[bytes]]
 """Gives the depth PNGs of views: row of the table of scenes, seeds of the views, cache folder."""
@@ -244,11 +244,6 @@ class _Files:
         if not part.schema.equals(schema):
             raise ValueError(f"{where} has the columns {', '.join(part.schema.names)}; expected version {VERSION}'s")
         return part, sha256
-
-
-def user_cache() -> Path:
-    """Folder of files that can be made again: $XDG_CACHE_HOME/dexzoo, or ~/.cache/dexzoo."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dexzoo"
 
 
 def _column(table: pa.Table, name: str) -> NDArray[np.int64]:

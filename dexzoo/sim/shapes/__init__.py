@@ -13,6 +13,7 @@ from functools import cache
 
 import numpy as np
 
+from dexzoo.sim import families
 from dexzoo.sim.objects import ObjectModel
 from dexzoo.sim.shapes import containers, flatware, vessels
 from dexzoo.sim.shapes.solid import Solid
@@ -91,11 +92,13 @@ def make_object(name: str) -> ObjectModel:
     It stands on z = 0 as it is to be placed, the middle of its bounds on the z axis.
 
     Args:
-        name: Name of the object.
+        name: Name of the object, such as mug_03, or of one of `dexzoo.sim.families`, such as revolved_00017.
 
     Raises:
         ValueError: The name is unknown; the error names those that exist.
     """
+    if families.is_shape(name):
+        return families.make_shape(name)
     category, number = _parse(name)
     rng = np.random.default_rng([zlib.crc32(category.encode()), number])
     solid = _MAKERS[category](rng, number)
