@@ -10,6 +10,8 @@ why in the commit. The file holds plain arrays, so that it outlives every class 
 - CASE.outcome.*: what the trial found, where there is a simulated scene
 - plan.*: one whole plan, refined; heuristic.*: the other generator; decoded: 200 rows of the set as waypoints
 - labels.*: 200 rows of the set, tried again; trial: the trial's own constants (metadata, JSON)
+
+pipeline.json beside it tells the processor that recorded, and how it rounds.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import fields
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +40,7 @@ from dexzoo.sim import ObjectModel, Outcomes, Scene, protocol, trial
 from dexzoo.sim.world import WORKING
 
 PATH = Path(__file__).with_suffix(".safetensors")
+PROCESSOR = Path(__file__).with_suffix(".json")
 REAL = Path(__file__).parents[3] / "shared" / "real"
 SCENES = (5, 17, 41, 47, 77)
 """Numbers of test scenes of the set; among their objects are such as lie on a block."""
@@ -182,6 +186,31 @@ def _plain(found: Outcomes) -> dict[str, Tensor]:
     return {field.name: torch.from_numpy(getattr(found, field.name)) for field in fields(Outcomes)}
 
 
+def rounding() -> str:
+    """A digest of sums, functions and convolutions that involve no code of ours: equal where libraries round alike.
+
+    The name of a processor does not tell: two generations, or two sizes of cache, may sum in another order.
+    """
+    torch.set_num_threads(1)
+    draw = torch.Generator().manual_seed(0)
+    wide, tall = torch.randn(300, 512, generator=draw), torch.randn(512, 70, generator=draw)
+    image, kernel = torch.randn(2, 16, 40, 40, generator=draw), torch.randn(32, 16, 3, 3, generator=draw)
+    half = torch.bfloat16
+    found = [wide @ tall, wide.double() @ tall.double(), wide.half() @ tall.half(), wide.to(half) @ tall.to(half)]
+    found += [torch.conv2d(image, kernel), torch.conv2d(image.to(half), kernel.to(half)), wide.sum(), wide.cumsum(1)]
+    found += [
+        wide.exp(),
+        wide.sin(),
+        wide.sigmoid(),
+        wide.logsumexp(1),
+        wide.abs().log(),
+        torch.linalg.inv(wide[:, :300]),
+    ]
+    arrays = [value.float().numpy() for value in found] + [wide.double().numpy() @ tall.double().numpy()]
+    vectors = torch.backends.cpu.get_cpu_capability().encode()
+    return sha256(vectors + b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
+
 def main() -> None:
     torch.set_num_threads(1)
     record: dict[str, Tensor] = {}
@@ -205,8 +234,8 @@ def main() -> None:
     add("heuristic", generated(observation, "heuristic"))
     record["decoded"] = decoded()
     add("labels", {"row": label_rows()} | labels(label_rows()))
-    metadata = {"processor": processor(), "trial": json.dumps(constants())}
-    save_file({name: value.contiguous() for name, value in record.items()}, PATH, metadata)
+    save_file({n: value.contiguous() for n, value in record.items()}, PATH, {"trial": json.dumps(constants())})
+    PROCESSOR.write_text(json.dumps({"processor": processor(), "rounding": rounding()}, indent=2) + "\n")
 
 
 if __name__ == "__main__":
