@@ -8,14 +8,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from portraits import COLORS, FONT, INK, portrait
 
-from dexzoo.perception.camera import Camera, look_at
 from dexzoo.sim.shapes import NUM_OBJECTS, make_object, object_names, split_of
 from dexzoo.viewing import pictures
 
 COLUMNS, CELL, HEADING, MARGIN = 26, 92, 26, 10
-COLORS = {"train": (226, 160, 62), "validation": (96, 170, 96), "test": (92, 142, 214)}
-INK, FONT = (30, 30, 30), cv2.FONT_HERSHEY_SIMPLEX
 
 
 def main() -> None:
@@ -34,7 +32,7 @@ def main() -> None:
             cv2.line(sheet, (left + 2, top + 23), (left + NUM_OBJECTS[category] * CELL - 6, top + 23), (200,) * 3, 1)
             for name in (name for name in object_names() if name.startswith(f"{category}_")):
                 left = MARGIN + column * CELL
-                sheet[top + HEADING : top + HEADING + CELL, left : left + CELL] = portrait(name)
+                sheet[top + HEADING : top + HEADING + CELL, left : left + CELL] = drawn(name)
                 column += 1
     pictures.save(sheet, options.out)
 
@@ -52,21 +50,12 @@ def pack() -> list[list[str]]:
     return shelves
 
 
-def portrait(name: str) -> np.ndarray:
-    """One object from in front and above, as large as its cell."""
+def drawn(name: str) -> np.ndarray:
+    """One object; a long one lies along the diagonal."""
     mesh = make_object(name).mesh
-    size = 2 * CELL  # drawn twice as large and scaled down, for smooth edges
     long = mesh.extents[2] < 0.3 * mesh.extents[0] and mesh.extents[1] < 0.7 * mesh.extents[0]
-    azimuth, elevation = (-48, 62) if long else (-60, 38)  # what is long lies along the diagonal
-    pose = look_at(mesh.bounds.mean(0), 1.2, np.deg2rad(azimuth), np.deg2rad(elevation))
-    seen = (mesh.vertices - pose[:3, 3]) @ pose[:3, :3]
-    image = seen[:, :2] / seen[:, 2:]
-    low, high = image.min(0), image.max(0)
-    focal = 0.92 * size / (high - low).max()
-    middle = size / 2 - focal * (low + high) / 2
-    camera = Camera(size, size, focal, focal, *middle.tolist())
-    picture, _ = pictures.render([pictures.Solid(mesh, COLORS[split_of(name)])], camera, pose, table=False)
-    return cv2.resize(picture, (CELL, CELL), interpolation=cv2.INTER_AREA)
+    azimuth, elevation = (-48, 62) if long else (-60, 38)
+    return portrait(mesh, COLORS[split_of(name)], CELL, azimuth, elevation)
 
 
 def legend(sheet: np.ndarray) -> None:

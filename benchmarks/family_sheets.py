@@ -9,14 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from PIL import Image
+from portraits import COLORS, FONT, INK, portrait
 
-from dexzoo.perception.camera import Camera, look_at
 from dexzoo.sim.families import family_names, make_shape, shape_name, split_of_shape
-from dexzoo.viewing import pictures
 
 COLUMNS, CELL, LABEL, HEADING = 8, 124, 16, 28
-COLORS = {"train": (226, 160, 62), "validation": (96, 170, 96), "test": (92, 142, 214)}
-INK, FONT = (30, 30, 30), cv2.FONT_HERSHEY_SIMPLEX
 
 
 def main() -> None:
@@ -38,7 +35,7 @@ def page(family: str, num: int) -> np.ndarray:
     cv2.putText(sheet, text, (8, 19), FONT, 0.5, INK, 1, cv2.LINE_AA)
     for index, name in enumerate(names):
         top, left = HEADING + index // COLUMNS * (CELL + LABEL), index % COLUMNS * CELL
-        sheet[top : top + CELL, left : left + CELL] = portrait(name)
+        sheet[top : top + CELL, left : left + CELL] = drawn(name)
         size = f"{100 * make_shape(name).mesh.extents.max():.0f} cm"
         cv2.putText(sheet, size, (left + CELL // 2 - 18, top + CELL + 10), FONT, 0.38, INK, 1, cv2.LINE_AA)
     return sheet
@@ -50,20 +47,11 @@ def save(picture: np.ndarray, path: Path) -> None:
     Image.fromarray(picture).quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-def portrait(name: str) -> np.ndarray:
-    """One object from in front and above, as large as its cell."""
+def drawn(name: str) -> np.ndarray:
+    """One object; a flat one is seen from higher up."""
     mesh = make_shape(name).mesh
-    size = 2 * CELL  # drawn twice as large and scaled down, for smooth edges
     flat = mesh.extents[2] < 0.25 * mesh.extents[:2].max()
-    pose = look_at(mesh.bounds.mean(0), 1.2, np.deg2rad(-60), np.deg2rad(60 if flat else 38))
-    seen = (mesh.vertices - pose[:3, 3]) @ pose[:3, :3]
-    image = seen[:, :2] / seen[:, 2:]
-    low, high = image.min(0), image.max(0)
-    focal = 0.92 * size / (high - low).max()
-    middle = size / 2 - focal * (low + high) / 2
-    camera = Camera(size, size, focal, focal, *middle.tolist())
-    picture, _ = pictures.render([pictures.Solid(mesh, COLORS[split_of_shape(name)])], camera, pose, table=False)
-    return cv2.resize(picture, (CELL, CELL), interpolation=cv2.INTER_AREA)
+    return portrait(mesh, COLORS[split_of_shape(name)], CELL, -60, 60 if flat else 38)
 
 
 if __name__ == "__main__":
